@@ -6,6 +6,7 @@ import logging
 import os
 import time
 import uuid
+from collections import Counter
 from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
@@ -14,7 +15,7 @@ KEPT_S = 90 * 86_400.0
 """Age at which a file is deleted: the version of the program that it belongs to may be gone."""
 
 _DIGEST_OCTETS = 32
-_cleaned: set[str] = set()
+_written = Counter[tuple[Path, str]]()
 
 
 def cache_folder() -> Path:
@@ -52,9 +53,9 @@ def made_once(name: str, make: Callable[[], bytes], most: int = 0) -> bytes:
 
 
 def keep(name: str, octets: bytes, most: int = 0) -> None:
-    """Keep octets under a name, in one piece, unless the folder cannot be written; delete old files.
+    """Keep octets under a name, in one piece, unless the folder cannot be written; delete old files now and then.
 
-    Of a kind, the name up to its hyphen, the newest files stay: at most ``most``, or all for 0.
+    Of a kind, the name up to its hyphen, the newest files stay: at most ``most`` and a sixteenth, or all for 0.
     """
     kind = name.partition("-")[0]
     folder = _folder_of(kind)
@@ -69,12 +70,11 @@ def keep(name: str, octets: bytes, most: int = 0) -> None:
         with suppress(OSError):
             part.unlink()  # of a full disk
         return
-    with suppress(OSError):
-        names = os.listdir(folder)
-        if kind in _cleaned and most and sum(other.startswith(kind) for other in names) <= most:
-            return  # many files of ground follow each other: their dates are read when there are too many
-        _cleaned.add(kind)
-        written = sorted(((folder / other).stat().st_mtime, other) for other in names)
+    _written[folder, kind] += 1
+    if (_written[folder, kind] - 1) % (max(most // 16, 1) if most else 16):
+        return  # a look at all files takes longer than all else
+    with suppress(OSError), os.scandir(folder) as files:
+        written = sorted((file.stat().st_mtime, file.name) for file in files)
         same = [other for _, other in written if other.partition("-")[0] == kind]
         old = [other for second, other in written if second < time.time() - KEPT_S]
         for other in {*old, *same[:-most]}:

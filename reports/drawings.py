@@ -1,4 +1,4 @@
-"""Figures of a document: drawn once for its renderings, kept for later documents, and as files."""
+"""Figures of a document: drawn once for its renderings, by two processes, kept for later documents, and as files."""
 
 from __future__ import annotations
 
@@ -7,7 +7,12 @@ import dataclasses
 import functools
 import hashlib
 import io
-from collections.abc import Iterator, Mapping
+import os
+import pickle
+import subprocess
+import sys
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from functools import partial
 from importlib.metadata import version
 from pathlib import Path
@@ -15,7 +20,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from kernels import made_once
+from kernels import keep, kept, made_once
 from reports.document import Picture
 from reports.figures.canvas import Canvas
 from reports.figures.svg import draw_svg
@@ -40,15 +45,95 @@ class Drawings(dict[str, str]):
         return self[one.key]
 
     def _drawn(self, one: Picture) -> str:
-        return draw_svg(one.key, one.width_in, one.height_in, one.draw, one.alt)
+        return _svg_of(one)
+
+    def prepare(self, pictures: Sequence[Picture]) -> None:
+        """Draw pictures ahead, where that takes less time; nothing here."""
+
+
+def _svg_of(one: Picture) -> str:
+    return draw_svg(one.key, one.width_in, one.height_in, one.draw, one.alt)
 
 
 class KeptDrawings(Drawings):
     """Drawings that are kept on disk by the hash of what they show, and drawn again if that or the code changed."""
 
+    def __init__(self, processes: DrawingProcesses | None = None) -> None:
+        super().__init__()
+        self._processes = processes
+
+    def prepare(self, pictures: Sequence[Picture]) -> None:
+        if self._processes is None:
+            return
+        names = {one.key: f"figure-{drawing_hash(one)}" for one in pictures}
+        self.update({key: octets.decode() for key, name in names.items() if (octets := kept(name)) is not None})
+        missing = [one for one in pictures if one.key not in self]
+        for one, svg in zip(missing, self._processes.draw(missing), strict=False):
+            keep(names[one.key], svg.encode(), KEPT_FIGURES)
+            self[one.key] = svg
+
     def _drawn(self, one: Picture) -> str:
         draw = super()._drawn
         return made_once(f"figure-{drawing_hash(one)}", lambda: draw(one).encode(), KEPT_FIGURES).decode()
+
+
+class DrawingProcesses:
+    """Two processes that draw the figures of one document; they load matplotlib while its values are computed.
+
+    They are started without `multiprocessing`, which would import the script of a user again.
+    """
+
+    def __init__(self) -> None:
+        program = f"import sys; sys.path[:] = {sys.path!r}; from reports.drawings import draw_given; draw_given()"
+        words = [sys.executable, "-P", "-c", program]
+        pipe, nothing = subprocess.PIPE, subprocess.DEVNULL
+        self._started = subprocess.Popen(words, stdin=pipe, stdout=pipe, stderr=nothing)
+
+    def draw(self, pictures: Sequence[Picture]) -> list[str]:
+        """Return the SVG of pictures, once; none if the processes failed: who asked draws them, and sees the fault."""
+        try:
+            octets, _ = self._started.communicate(pickle.dumps(list(pictures)))
+            drawn: list[str] = pickle.loads(octets)
+        except (OSError, ValueError, EOFError, AttributeError, TypeError, pickle.PickleError):
+            return []
+        return drawn
+
+    def close(self) -> None:
+        """End the processes."""
+        self._started.kill()
+        self._started.communicate()
+
+
+@contextmanager
+def drawing_processes(wanted: bool) -> Iterator[DrawingProcesses | None]:
+    """Yield started processes if they are wanted and the machine has room for them."""
+    started = None
+    with suppress(OSError):
+        started = DrawingProcesses() if wanted else None
+    try:
+        yield started
+    finally:
+        if started is not None:
+            started.close()
+
+
+def draw_given() -> None:
+    """Draw the pictures of standard input, each second one in a copy of this process, onto standard output."""
+    import reports.figures.axes  # noqa: F401  # before there is something to draw
+
+    pictures = pickle.load(sys.stdin.buffer)
+    ours, theirs = os.pipe()
+    half = 1 if os.fork() == 0 else 0
+    drawn = [_svg_of(one) for one in pictures[half::2]]
+    if half == 1:
+        with os.fdopen(theirs, "wb") as out:
+            pickle.dump(drawn, out)
+        os._exit(0)
+    os.close(theirs)
+    with os.fdopen(ours, "rb") as other:
+        whole = [""] * len(pictures)
+        whole[::2], whole[1::2] = drawn, pickle.load(other)
+    pickle.dump(whole, sys.stdout.buffer)
 
 
 def drawing_hash(one: Picture) -> str:
@@ -64,6 +149,8 @@ def _octets(value: Any) -> Iterator[bytes]:
     if isinstance(value, np.ndarray) and not value.dtype.hasobject:
         yield f"{value.dtype.str}{value.shape}".encode()
         yield value.tobytes()
+    elif isinstance(value, list | tuple) and all(type(part) in (str, int, float) for part in value):
+        yield f"{tuple(value)!r} ".encode()
     elif isinstance(value, list | tuple | np.ndarray):
         yield f"{len(value)} of ".encode()
         for part in value:

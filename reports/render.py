@@ -41,10 +41,13 @@ def render_pages(report: Any, drawings: Drawings | None = None) -> tuple[str, by
     InconsistentReport
         when parts of the value do not fit together
     """
+    from reports.document import Picture
     from reports.html_page import html_page
     from reports.pdf_pages import print_form
 
     document = _document(report)
+    if drawings is not None:
+        drawings.prepare([one for one in document.blocks if isinstance(one, Picture)])
     return html_page(document, drawings), print_form(document)
 
 

@@ -16,6 +16,35 @@ fov_deg = 120.0
 width_px = 512
 height_px = 512
 """
+SYNTHETIC = f"""{SELENITA}pointing = "nadir"
+k1 = 0.0
+[frames]
+orientation = "IAU WGCCRE 2009"
+gravity_field = "GRGM1200L (12x12, built in)"
+"""
+"""Of synthetic passes."""
+GOLDEN = f"""{SYNTHETIC}[reference]
+sigma_rtn_m = [3.0, 4.0, 0.0]
+[evidence]
+world = "real-terrain"
+unseen_share = 0.25
+[experiment]
+orbit_error_m = 1000.0
+[requirements]
+estimator = "spherical"
+median_error_m = 129.0
+p95_error_m = 131.0
+better_than = ["propagate-only"]
+packets_percent = 100.0
+frames_percent = 100.0
+images_percent = 100.0
+recall = 0.5
+precision = 0.5
+anchor_reads = 0.0
+resets = 0.0
+temperature_max_c = 21.0
+cpu_percent = 50.0
+"""
 _FILTER = """filter_gravity = "builtin"
 filter_degree = 8
 """

@@ -104,12 +104,9 @@ def test_what_packages_require_is_pinned_for_every_python(names, python):
             assert one.specifier.contains(version_of(known[name]), prereleases=True), one
 
 
-def test_a_package_that_only_older_pythons_need_is_looked_for():
+def test_every_declared_dependency_has_its_pin_also_what_only_older_pythons_need():
     assert "async-timeout" in needed("3.11.2", ("runtime",))
     assert "async-timeout" not in needed("3.11.3", ("runtime",))
-
-
-def test_every_declared_dependency_has_its_pin():
     assert {name_of(text) for text in PROJECT["dependencies"]} <= pins("runtime").keys()
     for extra in ["terrain", "postgres", "parquet", "traces", "oidc", "objects", "docs"]:
         assert {name_of(text) for text in EXTRAS[extra]} <= (pins("runtime") | pins(extra)).keys()

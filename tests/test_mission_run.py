@@ -1,11 +1,14 @@
 """A simulated mission from end to end: spacecraft, stations, ground, reports; and what goes on after a stop."""
 
 import json
+import re
 import sqlite3
-from contextlib import closing, nullcontext
+import subprocess
+import sys
+from contextlib import closing, nullcontext, suppress
 from dataclasses import replace
+from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
 from unittest.mock import Mock
 
 import numpy as np
@@ -27,6 +30,7 @@ from payload_emulator.session.archive.mission import live_mission_text
 from payload_emulator.session.scenario import parse_scenario
 from payload_emulator.session.world.regions import observed_boxes
 from payload_emulator.session.world.world import open_world
+from studies.harness.parts import descendants
 from studies.mission_run.checkpoints import Checkpoints
 from studies.mission_run.disturbances import UNDISTURBED, ReferenceDisturbances, load_disturbances
 from studies.mission_run.dynamics import FlightDynamics
@@ -41,7 +45,6 @@ SECOND = f'spacecraft = "Second"\nspacecraft_id = 77{SCENARIO.replace("seed = 3"
 DRIFT_PPM = 5.0
 
 
-Figures = dict[str, Any]
 NO_DATA = DataFolder(None)
 TERMS = RunTerms(days=0.25, windows_per_day=1, window_s=300.0)
 
@@ -90,6 +93,41 @@ def assert_same_figures(one, other):
     assert first == pytest.approx(second, rel=0.0, abs=2e-3, nan_ok=True) and len(first) > 50
     drift = {name: value for name, value in second.items() if name.endswith("drift_percent")}
     assert {name: first[name] for name in drift} == pytest.approx(drift, rel=0.0, abs=1e-6)
+
+
+def memory_by_day(folder, days):
+    """Return the resident memory in MiB of ground and spacecraft after each contact of a run, by day and process."""
+    found = {}
+    command = [
+        sys.executable,
+        "-m",
+        "linna",
+        "mission",
+        "run",
+        "selenita",
+        "--days",
+        str(days),
+        "--folder",
+        str(folder),
+    ]
+    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as run:
+        for line in run.stderr:
+            if day := re.search(r": day +(\d+)\.", line):
+                for pid in (run.pid, *descendants(run.pid)):
+                    with suppress(FileNotFoundError, AttributeError):
+                        kib = re.search(r"VmRSS:\s+(\d+)", Path(f"/proc/{pid}/status").read_text())[1]
+                        found.setdefault(pid, {}).setdefault(int(day[1]), []).append(int(kib) >> 10)
+    assert run.returncode == 0
+    return [one for one in found.values() if max(one[days - 1]) > 100]
+
+
+@pytest.mark.campaign
+def test_the_memory_of_a_simulated_week_ends_within_a_twentieth_of_that_of_its_second_day(tmp_path):
+    processes = memory_by_day(tmp_path / "week", 7)
+    assert len(processes) == 2
+    for days in processes:
+        assert np.median(days[6]) < 1.05 * np.median(days[1])
+        assert max(map(max, days.values())) <= 450
 
 
 @pytest.mark.campaign

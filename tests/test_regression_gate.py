@@ -1,8 +1,4 @@
-"""The gate of this project's own payload: its network and parameters pass a small suite.
-
-The passes are made here, on the procedural Moon (level 2): a few frames in the light of the paper, and with the faults
-of the shipped suite.
-"""
+"""The payload of this project passes a small suite, made here on the procedural Moon, with its faults."""
 
 import json
 

@@ -9,7 +9,6 @@ from pathlib import Path
 import pytest
 
 _SPEC = importlib.util.spec_from_file_location("sizes", Path(__file__).with_name("sizes.py"))
-assert _SPEC is not None and _SPEC.loader is not None
 sizes = importlib.util.module_from_spec(_SPEC)
 sys.modules["sizes"] = sizes
 _SPEC.loader.exec_module(sizes)

@@ -17,6 +17,7 @@ from lunar.arrays import BoolArray, FloatArray, IntArray
 from lunar.constants import NS
 from lunar.ephemeris import Ephemeris
 from lunar.timescales import tdb_s_from_utc_ns
+from reports.statistics import chi2_quantile
 from reports.values import DriftSample, ErrorBudget, NavigationStatistics
 
 
@@ -189,13 +190,8 @@ def squared_normalised_errors(error: ArrayLike, sigma: ArrayLike) -> FloatArray:
 
 def bounds(degrees: ArrayLike, probability: float = PROBABILITY) -> tuple[FloatArray, FloatArray]:
     """Return the two-sided bounds of one chi-square value; NaN for zero degrees of freedom."""
-    from scipy.special import gammaincinv  # imported here: few commands need it
-
-    freedom = np.asarray(degrees, dtype=np.float64)
-    freedom = np.where(freedom > 0.0, freedom, np.nan)
-    tail = 0.5 * (1.0 - probability)
-    shape = 0.5 * freedom
-    return np.asarray(2.0 * gammaincinv(shape, tail)), np.asarray(2.0 * gammaincinv(shape, 1.0 - tail))
+    tail, freedom = 0.5 * (1.0 - probability), np.asarray(degrees, dtype=np.float64)
+    return chi2_quantile(tail, freedom), chi2_quantile(1.0 - tail, freedom)
 
 
 def bounds_per_degree(degrees: float, samples: float, probability: float) -> tuple[float, float]:

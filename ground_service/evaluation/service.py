@@ -30,6 +30,7 @@ from ground_service.store.event_kinds import PassEvaluated, publish
 from ground_service.store.files import FileArchive, make_durable_folder, register_file, replace_durably
 from lunar.arrays import FloatArray
 from lunar.timescales import format_utc
+from reports import drawings
 from reports.document import evidence_number
 from reports.values import PassReport
 
@@ -124,12 +125,14 @@ def make_report(
     """
     identity = report_id or uuid.uuid4().hex
     now = utc_now_ns()
-    if again is None:
-        inputs = load_pass_inputs(ground, pass_id, created_utc=format_utc(now))
-        report = _evaluated(ground, inputs)
-    else:
-        inputs, report = again.inputs, replace(again.report, created_utc=format_utc(now))
-    documents = _documents(report)
+    is_first = again is None and ground.read(store.newest_report, pass_id) is None
+    with drawings.drawing_processes(is_first) as processes:  # few figures of a later report are new
+        if again is None:
+            inputs = load_pass_inputs(ground, pass_id, created_utc=format_utc(now))
+            report = _evaluated(ground, inputs)
+        else:
+            inputs, report = again.inputs, replace(again.report, created_utc=format_utc(now))
+        documents = _documents(report, drawings.KeptDrawings(processes))
     stored = {kind: ground.files.put_octets(octets) for kind, octets in documents.items()}
     summary = _summary(report, inputs)
     with ground.database.writing() as connection:
@@ -165,10 +168,10 @@ def make_report(
             )
     folder = out if out is not None else ground.home / "reports" / f"pass-{pass_id}"
     html, data = folder / "report.html", folder / "report.json"
-    _write_whole(html, documents["html"])
-    _write_whole(data, documents["json"])
     with suppress(OSError):
         (folder / "report.pdf").unlink()  # of the report before
+    _write_whole(html, documents["html"])
+    _write_whole(data, documents["json"])
     return MadeReport(identity, pass_id, html, data, summary)
 
 
@@ -228,12 +231,11 @@ def reevaluate(ground: Ground, pass_id: int, *, report_id: str, event: int) -> M
     return make_report(ground, pass_id, report_id=report_id, again=again)
 
 
-def _documents(report: PassReport) -> dict[str, bytes]:
+def _documents(report: PassReport, drawn: drawings.Drawings) -> dict[str, bytes]:
     """Return the octets of a report by kind."""
-    from reports.drawings import KeptDrawings
     from reports.render import render_pages, to_json
 
-    page, form = render_pages(report, KeptDrawings())
+    page, form = render_pages(report, drawn)
     return {"html": page.encode(), "json": to_json(report).encode(), "print": form}
 
 

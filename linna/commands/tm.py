@@ -312,7 +312,8 @@ def _read(arguments: argparse.Namespace, dictionary: Dictionary | None = None) -
         decoded = read(form=form)
         is_bare = decoded.settings is None and arguments.prefix_octets is None
         if is_bare and decoded.octets_skipped > decoded.packets:
-            decoded = read(form=replace(form, prefix_octets=find_prefix(as_octets(octets), form)))
+            prefixed = read(form=replace(form, prefix_octets=find_prefix(as_octets(octets), form)))
+            decoded = max(decoded, prefixed, key=lambda one: one.octets["packets"])
     except UnknownCoding as error:
         raise UsageError(f"{arguments.file}: expected {error.expected}, found {error.found}") from error
     if not decoded.packets and not decoded.frame_count:

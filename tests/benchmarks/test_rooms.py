@@ -16,12 +16,9 @@ MODULES = {
 }  # fmt: skip
 
 
-def test_rooms_floors_and_arrows_are_those_of_the_imports():
+def test_rooms_and_arrows_are_those_of_the_imports_and_a_circle_is_refused():
     """attic → hall → cellar, and attic → cellar inside a function; 7 of 12 lines import."""
     assert measure("house", MODULES) == Rooms(3, 3, 3, 6, 12, 7 / 12)
-
-
-def test_a_circle_of_imports_between_rooms_is_refused():
     with pytest.raises(CycleError, match="cycle"):
         measure("house", MODULES | {"house.cellar": "from house import attic\n"})
 

@@ -47,7 +47,7 @@ class Spelling:
     """Python text of types; `modules` are the modules of entities that it names."""
 
     def __init__(self):
-        self.modules: dict[str, str] = {}
+        self.modules = {}
         self._aliases = {
             value: (module.__name__, name)
             for module in [one for key, one in sys.modules.items() if key.startswith("ground_service.")]
@@ -128,8 +128,8 @@ def method_of(route, spelling):
     headers = header_names(dependant)
     arguments = [Argument(one.alias, spelling.kind(one.field_info.annotation)) for one in dependant.path_params]
     request = f'"{verb} {route.path.removeprefix(API_PREFIX)}"'
-    further: list[Argument] = []
-    query: dict[str, Any] = {}
+    further = []
+    query = {}
     for one in dependant.query_params:
         asked = one.field_info.annotation
         is_page = isinstance(asked, type) and issubclass(asked, Paging)

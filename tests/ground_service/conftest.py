@@ -16,6 +16,7 @@ import subprocess
 import tempfile
 import threading
 from collections import defaultdict
+from contextlib import nullcontext
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -44,6 +45,7 @@ from lunar.ephemeris import ephemeris_from_states
 from lunar.frames import IauOrientation, rtn_from_inertial, spherical_from_mcmf
 from lunar.messages.oem import save_oem
 from lunar.timescales import format_utc, parse_utc, tdb_s_from_utc_ns, ticks_from_utc_ns
+from reports import drawings
 from reports.drawings import Drawings
 from tests.serving import TestClient, wait_for
 from tmtc.dictionary.payload import DICTIONARY
@@ -154,6 +156,7 @@ def undrawn_figures():
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(Drawings, "svg", svg)
+        patch.setattr(drawings, "drawing_processes", lambda _wanted: nullcontext())
         yield draw
 
 
@@ -385,7 +388,7 @@ def define_pass_of(ground, made):
 
 
 def _housekeeping(k):
-    values: dict[str, Any] = {field.name: 0 for field in DICTIONARY.packet("housekeeping").fields}
+    values = {field.name: 0 for field in DICTIONARY.packet("housekeeping").fields}
     known = json.loads('{"structure_id": 1, "boot_count": 1, "mode": "observing", "bus_voltage_v": 12.0}')
     return values | known | {"frames_processed": k, "temperature_c": 20.0 + 0.1 * k}
 
@@ -591,5 +594,27 @@ class Clock:
 def mission_time():
     made = Clock()
     set_mission_clock(lambda: made.utc_ns)
-    yield made
-    set_mission_clock(None)
+    return made
+
+
+@pytest.fixture
+def now(mission_time):
+    """Mission time at the start of the synthetic passes."""
+    mission_time.utc_ns = START
+    return mission_time
+
+
+@pytest.fixture(autouse=True)
+def wall_clock_again():
+    """Let mission time be the wall clock after a test."""
+    yield
+    set_mission_clock()
+
+
+def steps_of(connection, work):
+    """Return the result of reading on a SQLite connection, and how much work the database did, in ten operations."""
+    database, done = connection.connection.driver_connection, []
+    database.set_progress_handler(lambda: done.append(1), 10)
+    found = work(connection)
+    database.set_progress_handler(None, 0)
+    return found, len(done)

@@ -2,7 +2,6 @@
 
 import logging
 from contextlib import contextmanager
-from typing import Any
 
 from pydantic import SecretStr
 
@@ -15,7 +14,7 @@ class ObjectServer:
 
     def __init__(self, port, bucket):
         self.port, self.bucket = port, bucket
-        self._server: Any = None
+        self._server = None
         self.start()
         self.store()._client().create_bucket(Bucket=bucket)
 
@@ -49,9 +48,7 @@ class ObjectServer:
 
     def store(self):
         """Return the store as a service sees it."""
-        found = objects_of(Settings(**self.settings()))
-        assert found is not None
-        return found
+        return objects_of(Settings(**self.settings()))
 
 
 @contextmanager

@@ -19,9 +19,6 @@ from tmtc.link.frames import Clcw, pack_clcw
 V1 = "/api/v1"
 
 
-Guarded = tuple[TestClient, dict[str, dict[str, str]]]
-
-
 @pytest.fixture(scope="module")
 def client(synthetic_pass, tmp_path_factory):
     """A service without users, with the synthetic pass in it; not to be given users."""
@@ -305,7 +302,6 @@ def test_a_socket_opens_whose_server_announces_the_client_late(client):
             handler.cancel()
             await asyncio.wait([handler])
 
-    assert client.portal is not None
     assert client.portal.call(opened)["type"] == "websocket.accept"
 
 

@@ -9,7 +9,6 @@ import threading
 import tracemalloc
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
-from typing import Any
 
 import httpx
 import pytest
@@ -17,7 +16,7 @@ import pytest
 from ground_service.app import create_app
 from ground_service.client import Client, ServiceProblem, connection
 from ground_service.client.connection import ATTEMPTS, BUSY_S, JobFailed, Unreachable
-from ground_service.client.local import local_client
+from ground_service.client.local import LocalDispatcher, local_client
 from ground_service.client.transport import LocalTransport
 from ground_service.ground import open_ground
 from ground_service.settings import Settings
@@ -295,7 +294,7 @@ def test_a_download_that_breaks_leaves_no_file(tmp_path, clock):
     assert list(tmp_path.iterdir()) == []
 
 
-ARGUMENTS: dict[str, Any] = json.loads("""{"constraints": {"a": 1}, "window": {"a": 1}, "change": {"a": 1},
+ARGUMENTS = json.loads("""{"constraints": {"a": 1}, "window": {"a": 1}, "change": {"a": 1},
     "plan": {"a": 1}, "request": {"a": 1}, "points": [{"a": 1}], "receptions": [{"a": 1}], "document": {"a": 1},
     "version": 1, "pinned": true, "format": "csv"}""") | {"file": b"octets"}
 
@@ -387,7 +386,8 @@ def test_the_example_of_the_documentation_runs(tmp_path, capsys, monkeypatch):
         """Client that ignores the address of the example."""
 
         def __init__(self, _server, token=None):
-            transport = LocalTransport(open_ground(tmp_path / "home"), "ann")
+            ground = open_ground(tmp_path / "home")
+            transport = LocalTransport(ground, "ann", LocalDispatcher(ground))
             super().__init__("http://localhost", token, transport=transport)
 
     monkeypatch.setattr("ground_service.client.Client", OnThisMachine)

@@ -10,7 +10,6 @@ import sys
 import time
 import tomllib
 from pathlib import Path
-from typing import Any
 
 import pytest
 import redis
@@ -21,8 +20,8 @@ from studies.harness.parts import Part, free_port, listens
 from tests.ground_service.conftest import cells
 
 ROOT = Path(__file__).resolve().parents[2]
-COMPOSE: dict[str, Any] = yaml.safe_load((ROOT / "docker-compose.yml").read_text())
-SERVICES: dict[str, dict[str, Any]] = COMPOSE["services"]
+COMPOSE = yaml.safe_load((ROOT / "docker-compose.yml").read_text())
+SERVICES = COMPOSE["services"]
 DOCKERFILE = (ROOT / "Dockerfile").read_text()
 (SECRETS,) = cells(
     "database_superuser_password | database_owner_password | database_password | database_backup_password | "
@@ -66,7 +65,7 @@ def test_every_service_is_confined(name):
     assert not any("docker.sock" in volume for volume in service["volumes"])
 
 
-def test_images_are_exact_versions():
+def test_images_are_exact_versions_and_the_lock_file_of_the_displays_has_checksums():
     for name in ("db", "broker", "proxy"):
         assert EXACT.fullmatch(default_of(SERVICES[name]["image"]))
     for name in ("PYTHON_IMAGE", "NODE_IMAGE"):
@@ -75,9 +74,6 @@ def test_images_are_exact_versions():
         assert given == written and EXACT.fullmatch(written)
     images = set(re.findall(r"^FROM (\S+)", DOCKERFILE, re.MULTILINE)) - {"sources"}
     assert images == {"${PYTHON_IMAGE}", "${NODE_IMAGE}"}
-
-
-def test_the_lock_file_of_the_displays_names_no_host_and_has_checksums():
     lock = json.loads((ROOT / "deploy/openmct/package-lock.json").read_text())
     wanted = json.loads((ROOT / "deploy/openmct/package.json").read_text())["dependencies"]
     found = {name: one for name, one in lock["packages"].items() if name}
@@ -135,15 +131,12 @@ backup | {without_broker} LINNA_DATABASE_URL LINNA_DATABASE_PASSWORD_FILE
     assert all(set(environment_of(name)) <= known for name in PROCESSES)
 
 
-def test_the_pools_of_all_processes_fit_into_the_connections_of_the_database():
+def test_pools_fit_into_the_connections_and_the_role_of_the_backup_changes_nothing():
     text = (ROOT / "ground_service/store/database.py").read_text()
     each = sum(int(re.search(rf"{name}=(\d+)", text)[1]) for name in ("pool_size", "max_overflow"))
     processes = sum(int(default_of(str(SERVICES[name].get("scale", 1)))) for name in PROCESSES)
     permitted = int(re.search(r"max_connections=(\d+)", (ROOT / "deploy/postgres.sh").read_text())[1])
     assert each * processes <= permitted - 10
-
-
-def test_the_role_of_the_backup_reads_an_archive_that_it_cannot_change():
     backup = SERVICES["backup"]
     assert backup["profiles"] == ["backup"] and backup["restart"] == "no"
     assert "archive:/var/lib/linna:ro" in backup["volumes"]
@@ -344,7 +337,7 @@ def test_nothing_stays_of_a_base_backup_that_fails(tmp_path):
     assert done.returncode == 1 and list((wal / "base").iterdir()) == []
 
 
-def test_an_api_process_drains_before_it_ends_and_the_proxy_has_another_one():
+def test_the_proxy_has_a_second_api_while_one_drains_and_sees_certificates_at_the_documented_reload():
     proxy = (ROOT / "deploy/nginx.conf").read_text()
     upstream = re.findall(r"^ +server (\w+):8042 ", proxy, re.MULTILINE)
     assert upstream == ["api", "api2"] and set(upstream) <= set(SERVICES["proxy"]["depends_on"])
@@ -353,20 +346,14 @@ def test_an_api_process_drains_before_it_ends_and_the_proxy_has_another_one():
         drain_s = int(environment_of(name)["LINNA_DRAIN_S"])
         # Then 20 s for requests in progress.
         assert idle_s < drain_s and drain_s + 20 < int(SERVICES[name]["stop_grace_period"].removesuffix("s"))
-
-
-def test_the_documented_reload_names_the_configuration_of_the_proxy():
-    """The default configuration of nginx names another file with the number of the process."""
+    # The default configuration of nginx names another file with the number of the process.
     program, flag, configuration, *_ = SERVICES["proxy"]["entrypoint"]
     reload = f"`docker compose exec proxy {program} {flag} {configuration} -s reload`"
     for name in ("docs/deployment.md", "deploy/prometheus/linna.rules.yml"):
         text = (ROOT / name).read_text()
         assert reload in text and text.count("-s reload") == text.count(reload), name
     assert f"./deploy/nginx.conf:{configuration}:ro" in SERVICES["proxy"]["volumes"]
-
-
-def test_a_renewed_certificate_is_seen_by_the_proxy():
-    """A mount of one file keeps the old file when a new one takes its place."""
+    # A mount of one file keeps the old file when a new one takes its place.
     (mount,) = (one for one in SERVICES["proxy"]["volumes"] if one.endswith(":/run/tls:ro"))
     assert mount == "${LINNA_SECRETS_DIR:-./secrets}/tls:/run/tls:ro"
     used = re.findall(r"ssl_certificate(?:_key)? (\S+);", (ROOT / "deploy/nginx.conf").read_text())
@@ -384,15 +371,12 @@ def test_the_documented_restore_uses_services_volumes_and_folders_that_exist():
     assert "LINNA_MIGRATION_DATABASE_URL" in SERVICES["migrate"]["environment"]
 
 
-def test_the_image_runs_as_nobody_in_particular():
+def test_the_image_runs_as_nobody_in_particular_and_holds_every_package_and_no_more():
     stage = DOCKERFILE.split("\nFROM ")[-1]
     (user,) = re.findall(r"^USER (\d+):\d+$", stage, re.MULTILINE)
     assert int(user) >= 10_000
     assert stage.index("USER") > stage.index("COPY")
     assert not re.search(r"^(ADD|RUN .*(curl|wget|chmod 777))", DOCKERFILE, re.MULTILINE)
-
-
-def test_the_image_holds_every_package_and_the_folder_of_the_build_no_more_than_it_needs():
     copied = {line.split()[1] for line in re.findall(r"^COPY (?!--from).*$", DOCKERFILE, re.MULTILINE)}
     found = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["setuptools"]["packages"]["find"]
     packages = {name.rstrip("*") for name in found["include"]}

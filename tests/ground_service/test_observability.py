@@ -44,8 +44,7 @@ def alerts():
 
 
 def panels():
-    found = json.loads(DASHBOARD.read_text())["panels"]
-    return found
+    return json.loads(DASHBOARD.read_text())["panels"]
 
 
 def expressions():
@@ -60,7 +59,6 @@ def samples(tmp_path_factory, synthetic_pass):
     with open_ground(folder / "home") as ground:
         vehicle = ingest_file(ground, synthetic_pass.folder / "downlink.cadu").vehicle_id
         enter_job(ground, "report", {"pass_id": 1})
-        assert vehicle is not None
         add_correlation(ground, vehicle, utc_now_ns())
         backup(ground, folder / "backups" / "one", now_utc_ns=utc_now_ns())
     settings = Settings(home=folder / "home", backups=folder / "backups")
@@ -84,7 +82,7 @@ def add_correlation(ground, vehicle, created_utc_ns):
         repository.add(connection, repository.CORRELATIONS, **line, **given)
 
 
-def test_every_metric_and_label_of_alerts_and_dashboard_exists(samples):
+def test_metrics_and_labels_of_alerts_and_dashboard_are_those_of_the_condition(samples):
     for expression in expressions():
         named = set(NAME.findall(expression))
         assert named or "up{" in expression or "probe_ssl_earliest_cert_expiry{" in expression, expression
@@ -94,23 +92,17 @@ def test_every_metric_and_label_of_alerts_and_dashboard_exists(samples):
         for grouped in re.findall(r"\bby \(([^)]*)\)", expression):
             labels = {label.strip() for label in grouped.split(",")}
             assert labels <= set().union(*(samples[name] for name in named)), expression
-
-
-def test_every_metric_of_the_condition_is_drawn_or_has_an_alert(samples):
     used = {name for expression in expressions() for name in NAME.findall(expression)}
     families = {re.sub(r"_(bucket|count|sum|created|total)$", "", name) for name in samples}
     assert families == {re.sub(r"_(bucket|total)$", "", name) for name in used}
 
 
-def test_every_alert_has_a_severity_a_summary_and_an_action():
+def test_every_alert_has_a_severity_a_summary_and_an_action_and_the_limit_of_the_status():
     names = [rule["alert"] for rule in alerts()]
     assert len(set(names)) == len(names) >= 10
     for rule in alerts():
         assert rule["labels"]["severity"] in ("page", "ticket")
         assert set(rule["annotations"]) == {"summary", "action"}
-
-
-def test_the_limits_of_the_status_are_those_of_the_alerts():
     limits = {rule["alert"]: [float(word) for word in re.findall(r"[<>] ([0-9.]+)", rule["expr"])] for rule in alerts()}
     names = (
         "QueueOld QUEUE_AGE_LIMIT_S IngestLag INGEST_LAG_LIMIT_S DiskFull DISK_FREE_LIMIT BackupOld BACKUP_AGE_LIMIT_S"
@@ -284,7 +276,6 @@ def test_ages_of_waiting_work_and_of_correlations(either, synthetic_pass):
     assert (idle.queue_age_s, idle.ingest_lag_s, idle.backup_age_s) == (0.0, 0.0, None)
     assert 0 < idle.disk_free <= idle.disk_size and idle.scheduler is None
     vehicle = ingest_file(either, synthetic_pass.folder / "downlink.cadu").vehicle_id
-    assert vehicle is not None
     # A finished ingest does not wait. The jobs of the other ages are older than the test.
     assert read_condition(either, None).ingest_lag_s == 0.0
     waiting, done = (enter_job(either, "plan", {}) for _ in range(2))

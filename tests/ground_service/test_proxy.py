@@ -121,21 +121,15 @@ def proxied(tmp_path_factory):
         service.wait(60)
 
 
-def test_the_service_is_reached_over_tls_with_hsts(proxied):
+def test_the_service_is_reached_over_new_tls_with_hsts_only(proxied):
     with proxied.client() as client:
         answer = client.get("/api/v1/passes", headers={"Authorization": f"Bearer {proxied.token}"})
     assert answer.status_code == 200
     assert answer.headers["strict-transport-security"] == "max-age=31536000"
     # The headers of the service are kept, once each.
     assert answer.headers["x-content-type-options"] == "nosniff"
-
-
-def test_plain_http_is_sent_to_https(proxied):
     answer = httpx.get(f"http://{proxied.host}/passes?a=1")
     assert (answer.status_code, answer.headers["location"]) == (308, f"{proxied.url}/passes?a=1")
-
-
-def test_old_tls_is_refused(proxied):
     context = ssl.create_default_context(cafile=str(proxied.certificate))
     context.set_ciphers("ALL:@SECLEVEL=0")
     context.options &= ~ssl.OP_NO_TLSv1_1
@@ -164,15 +158,12 @@ def test_the_address_of_the_client_cannot_be_forged(proxied):
     assert addresses() == ["127.0.0.1"]
 
 
-def test_the_cookie_of_a_session_is_for_tls_only(proxied):
+def test_the_cookie_of_a_session_is_for_tls_only_and_a_websocket_goes_through(proxied):
     with proxied.client() as client:
         answer = client.post("/api/v1/session", json={"token": proxied.token}, headers={"Origin": proxied.url})
         assert answer.status_code == 200, answer.text
         assert "secure" in answer.headers["set-cookie"].lower().split("; ")
         assert client.get("/api/v1/session").json()["name"] == "ann"
-
-
-def test_a_websocket_goes_through(proxied):
     context = ssl.create_default_context(cafile=str(proxied.certificate))
     address = f"wss://{proxied.host}/api/v1/live"
     headers = {"Authorization": f"Bearer {proxied.token}"}

@@ -1,5 +1,6 @@
-"""The cache of compiled functions is shared by processes and clones, and never gives code of other sources."""
+"""The cache of compiled functions, shared by processes and clones; memory that goes back to the system."""
 
+import ctypes
 import gc
 import importlib
 import os
@@ -7,10 +8,12 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from unittest.mock import MagicMock
 
 import pytest
+from pytest import fixture, mark
 
-from kernels import KEPT_S, keep, kept
+from kernels import KEPT_S, keep, kept, memory
 
 ROOT = Path(__file__).resolve().parents[2]
 CALLEE = """
@@ -139,6 +142,17 @@ def test_the_folder_is_private_and_files_of_others_are_ignored(tmp_path, monkeyp
     assert (tmp_path / "of-a-user").stat().st_mode & 0o777 == 0o700
 
 
+def test_the_newest_files_of_a_kind_stay_and_not_each_one_costs_a_look_at_all(tmp_path, monkeypatch):
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "cache"))
+    looks, scandir = [], os.scandir
+    monkeypatch.setattr(os, "scandir", lambda folder: looks.append(folder) or scandir(folder))
+    for number in range(70):
+        keep(f"a-{number:03}", b"", 32)
+    assert len(looks) == 35
+    assert sorted(file.name for file in (tmp_path / "cache").iterdir())[0] > "a-035"
+    assert kept("a-038") == kept("a-069") == b""
+
+
 def test_damaged_and_unwritable_caches_are_compiled_around(tmp_path):
     cache, folder = tmp_path / "cache", write(tmp_path / "code")
     run(folder, cache)
@@ -229,3 +243,55 @@ def test_declared_versions_are_compiled_at_the_same_time_and_once(tmp_path, monk
     with compiling_ahead([["caller"]], said.append) as wait:
         wait()
     assert len(said) == 2
+
+
+RESIDENT = """
+import sys
+from kernels import memory
+def resident():
+    return int(open("/proc/self/statm").read().split()[1]) * 4 // 1024
+blocks = [b"." * 60_000 + bytes([k % 256]) for k in range(4000)]
+kept = blocks[::400]
+full = resident()
+del blocks
+before = resident()
+assert memory.give_back()
+print(full, before, resident(), len(kept))
+"""
+
+
+@fixture
+def library(monkeypatch):
+    found = MagicMock(spec=["mallopt", "malloc_trim"])
+    monkeypatch.setattr(memory, "_c_library", lambda: found)
+    monkeypatch.setattr(memory, "_last_s", -memory.INTERVAL_S)
+    return found
+
+
+def test_memory_is_given_back_once_in_an_interval(library, monkeypatch):
+    now = [0.0]
+    monkeypatch.setattr(memory.time, "monotonic", lambda: now[0])
+    done = []
+    for now[0] in (0.0, memory.INTERVAL_S - 0.1, memory.INTERVAL_S, memory.INTERVAL_S + 0.1):
+        done.append(memory.give_back())
+    assert done == [True, False, True, False]
+    assert library.malloc_trim.call_count == 2
+
+
+def test_the_number_of_heaps_is_limited(library):
+    memory.limit_heaps()
+    library.mallopt.assert_called_once_with(-8, memory.HEAPS)
+
+
+def test_another_c_library_is_left_alone(library):
+    del library.mallopt, library.malloc_trim
+    memory.limit_heaps()
+    assert memory.give_back() is False
+
+
+@mark.skipif(not hasattr(ctypes.CDLL(None), "malloc_trim"), reason="needs glibc")
+def test_free_memory_between_blocks_in_use_goes_back():
+    done = subprocess.run([sys.executable, "-c", RESIDENT], capture_output=True, text=True, check=True)
+    full, before, after, _ = map(int, done.stdout.split())
+    assert full > 200
+    assert after < full - 150, (full, before, after)

@@ -1,7 +1,4 @@
-"""Commands about catalogues and identification: figures as JSON, bad input in one line. `linna link check`:
-proposals, contradictions with a mission description, and unknown settings. Commands and options on which
-scripts rely keep their names.
-"""
+"""Commands about catalogues, identification and link settings; the names on which scripts rely."""
 
 import hashlib
 import math

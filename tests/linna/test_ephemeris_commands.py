@@ -84,17 +84,11 @@ def test_figures_of_states_that_gravity_does_not_move_are_refused(tmp_path, type
     assert "expected an acceleration of" in line and "% off" in line
 
 
-def test_a_kernel_without_the_number_of_the_spacecraft_is_one_line(oem_path, tmp_path, typed):
+def test_a_kernel_without_its_number_an_unknown_format_and_a_file_cut_short_are_one_line(oem_path, tmp_path, typed):
     line = typed(f"orbit convert {oem_path} --out {tmp_path}/orbit.bsp", 2)
     assert "--spice-id: expected the SPICE number of the spacecraft, such as -85, found none" in line
-
-
-def test_a_conversion_to_an_unknown_format_is_one_line(oem_path, tmp_path, typed):
     line = typed(f"orbit convert {oem_path} --out {tmp_path}/orbit.json", 2)
     assert "expected a name ending in .oem, .xml, .bsp, .e, .csv, .tum, found 'orbit.json'" in line
-
-
-def test_a_file_cut_short_is_one_line(oem_path, tmp_path, typed):
     cut = tmp_path / "cut.oem"
     cut.write_text(oem_path.read_text()[:2000])
     assert "cut.oem: line" in typed(f"orbit compare {cut} {oem_path}", 2)
@@ -102,7 +96,7 @@ def test_a_file_cut_short_is_one_line(oem_path, tmp_path, typed):
 
 def test_interpolate_gives_states_at_the_epochs_of_a_file(oem_path, tmp_path, typed):
     epochs = tmp_path / "epochs.txt"
-    epochs.write_text("# two epochs\n2029-08-07T00:00:00Z\n\n2029-08-07T12:34:56.789123Z  # odd\n")
+    epochs.write_text("\ufeff# two epochs\n2029-08-07T00:00:00Z\n\n2029-08-07T12:34:56.789123Z  # odd\n")
     figures = typed(f"orbit interpolate {oem_path} --epochs {epochs} --json")
     first, second = figures["states"]
     assert set(first) == {*("epoch", "position_km", "velocity_km_s", "latitude_deg", "longitude_deg", "altitude_km")}

@@ -48,18 +48,12 @@ def test_the_document_has_the_figures_tables_and_differences(document):
     assert "5" in images["paper"] and "0.1 h" in images["here"] and "32.5 h" in images["reason"]
 
 
-def test_a_second_run_repeats_no_step(document):
+def test_a_second_run_repeats_no_step_and_the_document_says_what_lacks_without_torch_and_data(document):
     announced, *steps = document[2]
     assert announced.startswith("this takes") and steps
     assert all(line.endswith(": already done") for line in steps)
-
-
-def test_without_torch_the_document_says_what_it_lacks(document):
     assert "torch" in document[1]["not_available"]["sessions"]
     assert not [figure for figure in document[1]["figures"] if figure["key"].startswith("own-")]
-
-
-def test_without_data_every_level_is_that_of_the_procedural_moon(document):
     levels = {figure["key"]: figure["level"] for figure in document[1]["figures"]}
     assert all(level.startswith(("level 1", "level 2")) for level in levels.values()), levels
 

@@ -102,16 +102,13 @@ def test_a_file_without_telemetry_is_refused_in_one_line(tmp_path, typed, conten
     assert error == f"linna: error: {path}: expected CADUs or space packets, found none in its {len(content)} octets"
 
 
-def test_frames_of_an_unknown_coding_are_refused_with_the_name_of_the_file(tmp_path, typed):
+def test_frames_of_an_unknown_coding_and_a_missing_file_are_refused_with_the_name_of_the_file(tmp_path, typed):
     noise = np.random.default_rng(3).integers(0, 256, (30, 700), dtype=np.uint8)
     noise[:, :4] = np.frombuffer(ASM, dtype=np.uint8)
     (tmp_path / "odd.cadu").write_bytes(noise.tobytes())
     for command in ("check", "decode"):
         line = typed(f"tm {command} {tmp_path}/odd.cadu", 2)
         assert "odd.cadu" in line and "700 octets apart" in line
-
-
-def test_a_missing_file_is_refused_in_one_line(tmp_path, typed):
     typed(f"tm decode {tmp_path}/absent", 2)
 
 
@@ -162,6 +159,10 @@ def test_packets_without_error_control_are_checked_only_when_stated(foreign, typ
     assert "each behind 4 other octets" in typed(strict)
     for octets in (5, -1):
         typed(f"{strict} --prefix-octets {octets}", 2)
+    short = [struct.pack(">HHHHIHHI", 0x8C8, 0xC000 | k, 13, 26000, 1000 * k, 2500, 330, 0) for k in range(8)]
+    capture.write_bytes(b"".join([*short[:4], bytes((0x55,)) * 13, *short[4:]]))
+    noisy = typed(f"tm check {capture} --no-error-control --json")
+    assert (noisy["packets"], noisy["prefix_octets"], noisy["octets"]["skipped"]) == (7, 0, 13)
 
 
 def test_packets_of_another_mission_are_decoded_through_their_definition(foreign, tmp_path, typed):

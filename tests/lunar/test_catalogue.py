@@ -60,20 +60,14 @@ def test_the_index_holds_over_the_meridian_and_at_the_poles(place_deg):
     assert np.array_equal(found, np.flatnonzero(distance <= 200e3))
 
 
-def test_an_empty_catalogue_answers_with_nothing():
+def test_classes_hold_their_limits_positions_stand_at_rim_height_and_nothing_answers_with_nothing():
     empty = CATALOGUE.select(np.zeros(0, dtype=bool))
     assert (len(empty), empty.near(0.0, 0.0, 1e6).shape, empty.position_mcmf_m.shape) == (0, (0,), (0, 3))
     assert class_counts(empty).tolist() == [0, 0, 0]
     assert len(CATALOGUE.select([])) == 0
-
-
-def test_classes_hold_their_lower_limits_and_the_last_its_upper():
     diameters = [2999.9, 3000, 4999.9, 5000, 9999.9, 10_000, 14_999.9, 15_000, 30_000, 30_000.1, np.nan]
     assert size_class(diameters).tolist() == [-1, 3, 3, 0, 0, 1, 1, 2, 2, -1, -1]
     assert size_class(7000.0).shape == ()
-
-
-def test_positions_stand_at_rim_height_and_are_unknown_without_one():
     radius = np.linalg.norm(CATALOGUE.position_mcmf_m, axis=1)
     assert np.isnan(radius).any()
     assert np.allclose(radius, MOON_RADIUS_M + CATALOGUE.rim_height_m, atol=1e-6, equal_nan=True)

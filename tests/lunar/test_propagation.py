@@ -1,7 +1,4 @@
-"""Orbits against closed forms, against a tighter run, and where they end; elements and burns by their
-definitions. Earth and Sun seen from the Moon against a published ephemeris. Differences of ephemerides in
-radial, transverse and normal axes.
-"""
+"""Orbits against closed forms, a tighter run and a published ephemeris; elements, burns, differences."""
 
 import json
 import math
@@ -50,14 +47,11 @@ GM = builtin_gravity().gm_m3_s2
 INITIAL = state_from_elements(TABLE_I, GM)
 
 
-def test_elements_come_back_from_the_state_they_give():
+def test_elements_come_back_from_their_state_and_a_point_mass_gives_the_orbit_of_kepler():
     back = elements_from_state(*INITIAL, GM)
     assert back.semi_major_axis_m == pytest.approx(TABLE_I.semi_major_axis_m, abs=1e-5)  # m
     for name in ("eccentricity", "inclination_rad", "raan_rad", "argument_of_perilune_rad", "true_anomaly_rad"):
         assert getattr(back, name) == pytest.approx(getattr(TABLE_I, name), abs=1e-11), name
-
-
-def test_a_point_mass_gives_the_orbit_of_kepler():
     trajectory = propagate(EPOCH_S, *INITIAL, 86_400.0, KEPLER)
     for elapsed_s in (0.0, 1_234.5, 40_000.0, 86_400.0):
         error_m = np.linalg.norm(
@@ -221,15 +215,12 @@ def test_pulls_on_a_low_orbit_are_those_of_de421(body):
         assert np.linalg.norm(ours_m - theirs_m) < {"earth": 5e3, "sun": 15e3}[body], epoch["jd_tdb"]
 
 
-def test_whole_arrays_of_epochs_keep_their_shape():
+def test_arrays_of_epochs_keep_their_shape_and_have_the_positions_of_each():
     times = np.linspace(0.0, 1e9, 6).reshape(2, 3)
     for position in (earth_position_icrf_m, sun_position_icrf_m):
         many = position(times)
         assert many.shape == (2, 3, 3)
         assert_allclose(many[1, 2], position(times[1, 2]), atol=1e-3)  # m
-
-
-def test_many_epochs_have_the_positions_of_each():
     times = 9e8 + np.arange(2100.0).reshape(3, 700) * 60.0
     for position in (earth_position_icrf_m, sun_position_icrf_m):
         assert_allclose(position(times)[::2, ::50], position(times[::2, ::50]), rtol=0.0, atol=0.02)  # m
@@ -261,13 +252,10 @@ def test_a_larger_orbit_differs_radially_a_late_one_along_track_and_a_shifted_on
     assert (across.max_m, across.rms_m) == pytest.approx((3.0, 3.0), abs=1e-6)
 
 
-def test_only_common_epochs_count_and_other_steps_are_interpolated():
+def test_common_or_given_epochs_count_and_other_steps_are_interpolated():
     difference = compare(ephemeris(), ephemeris(np.arange(50) * 45.0))
     assert difference.samples == 74  # 0 to 2205 s in steps of 30 s
     assert difference.max_m < 1e-3
-
-
-def test_given_epochs_are_used():
     epochs = START + np.array([100, 200, 300]) * NS
     assert compare(ephemeris(), ephemeris(), epochs).samples == 3
     for other, asked in ((ephemeris(), epochs + 86_400 * NS), (ephemeris(ELAPSED_S + 1e6), None)):

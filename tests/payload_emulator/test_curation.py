@@ -107,25 +107,19 @@ def test_centres_sizes_and_rim_heights_are_refitted(field, curation):
     assert np.abs(np.median(curation.table.rim_height_m - rim)) < 25.0
 
 
-def test_every_crater_is_kept_or_dropped_for_one_reason_and_the_shallow_ones_are_dropped(field):
+def test_craters_are_dropped_for_one_reason_shallow_without_terrain_or_below_a_deeper_one(field):
     listed = field.listed()
     curation = curate(listed, field)
     assert len(curation.table) + sum(curation.dropped.values()) == len(listed)
     shallow = set(np.flatnonzero(field.depth < 0.02 * field.diameter).tolist())
     assert not shallow & set(curation.table.ids.tolist())
     assert curation.dropped["shallow"] >= len(shallow)
-
-
-def test_a_crater_without_terrain_is_dropped_and_a_map_without_any_is_refused(field):
     listed = field.listed()
     moved = replace(listed, latitude_rad=listed.latitude_rad + np.radians(20.0))
     with pytest.raises(TerrainError, match="expected heights under some of"):
         curate(moved, field)
     half = replace(listed, latitude_rad=listed.latitude_rad + np.radians(3.0))
     assert curate(half, field).dropped["no_terrain"] > 0
-
-
-def test_of_two_craters_on_top_of_each_other_the_deeper_stays(field):
     listed = field.listed(error_m=0.0)
     twice = listed.select(np.r_[np.arange(len(listed)), [0]])
     twice = replace(twice, ids=np.arange(len(twice)))

@@ -1,6 +1,4 @@
-"""A pass with contacts, losses and faults, without rendering: the archive's own account is what the ground
-finds.  Errors of the reference: their sizes, their dynamics, and that shipped scenarios have them.
-"""
+"""A pass with contacts, losses and faults: the archive's own account is what the ground finds."""
 
 import hashlib
 import json
@@ -222,7 +220,7 @@ def frame(scenario):
     return render_frame(scenario, DataFolder(), EPOCH)
 
 
-def test_a_frame_tells_where_it_was_taken_and_under_what_sun(frame):
+def test_a_frame_tells_where_and_under_what_sun_it_was_taken_as_json_without_nan(frame):
     assert frame.image.shape == (512, 512, 3) and frame.image.dtype == np.uint8
     assert frame.metadata["epoch"] == "2029-08-07T00:10:00.000Z"
     # The paper's light, and its orbit's altitudes.
@@ -230,9 +228,6 @@ def test_a_frame_tells_where_it_was_taken_and_under_what_sun(frame):
     assert -45.0 <= frame.metadata["sun_azimuth_deg"] <= 45.0
     assert 10.0 < frame.metadata["altitude_km"] < 60.0
     assert len(frame.metadata["corners_deg"]) == 4
-
-
-def test_metadata_and_labels_are_json_without_nan(frame):
     text = json.dumps({"metadata": frame.metadata, "labels": frame.labels}, allow_nan=False)
     assert json.loads(text)["labels"] == frame.labels
     assert any(label["inside"] for label in frame.labels)
@@ -305,14 +300,11 @@ def test_the_wrong_orbit_is_an_orbit():
     assert worst < 0.02
 
 
-def test_the_same_seed_gives_the_same_errors_and_none_gives_the_truth():
+def test_the_same_seed_gives_the_same_errors_none_the_truth_and_an_offset_adds_in_squares():
     np.testing.assert_array_equal(errors_rtn_m(SECTION, 1), errors_rtn_m(SECTION, 1))
     assert np.abs(errors_rtn_m(SECTION, 1) - errors_rtn_m(SECTION, 2)).max() > 1.0
     truth = circle()
     assert with_reference_error(truth, ReferenceSection(), 1) is truth
-
-
-def test_a_constant_offset_adds_in_squares():
     section = ReferenceSection(position_error_m=40.0, radial_m=30.0, transverse_m=60.0)
     assert section.sigma_rtn_m == pytest.approx((50.0, math.hypot(40.0, 60.0), 40.0))
 

@@ -1,4 +1,4 @@
-"""Images and inputs of a live pass, made again from the declared world, and what is refused."""
+"""Images and inputs of a live pass, made again from the declared world; rings of craters over them."""
 
 import json
 import shutil
@@ -16,8 +16,10 @@ from payload_emulator.session.archive.replay import FlightBuild, complete_archiv
 from payload_emulator.session.live.station_ports import RECORD_HEADER
 from payload_emulator.session.scenario import format_scenario, parse_scenario
 from payload_emulator.session.spacecraft.loading import launch_payload
-from payload_emulator.session.world.world import clock_ticks, first_utc_ns, open_world
+from payload_emulator.session.world.camera import Exposure, craters_in_view
+from payload_emulator.session.world.world import build_world, clock_ticks, first_utc_ns, open_world
 from tests.payload_emulator.test_continuous import CADU, EPOCH, HOUR_NS, NS, first, flown, scenario
+from tests.scenarios import still_scenario
 from tmtc.dictionary.payload import DICTIONARY
 from tmtc.downlink import decode
 from tmtc.link.settings import LinkSettings
@@ -172,3 +174,39 @@ def test_only_a_payload_as_launched_reports_images(tmp_path):
             **{name: getattr(launched, name) for name in ("camera", "modes", "odometry", "anchored")},
         ).hash
     )
+
+
+SCENARIO = (
+    still_scenario("overlay", 30.0, 1)
+    + """[camera]
+tilt_deg = 12.0
+k1 = -0.02
+"""
+)
+RIM_M = 5_000.0
+
+
+def test_rings_lie_where_rims_on_high_ground_are_seen_by_a_tilted_distorted_camera():
+    world = build_world(parse_scenario(SCENARIO), DataFolder())
+    utc_ns = int(world.frame_utc_ns[0])
+    position = world.truth.positions_mcmf(utc_ns)[0]
+    rotation = world.camera_from_mcmf(position)
+    exposure = Exposure(utc_ns, np.zeros((8, 8, 3), dtype=np.uint8), np.zeros(7), 0, rotation)
+    craters = world.terrain.catalogue
+    world.terrain.catalogue = replace(craters, rim_height_m=np.full(len(craters), RIM_M))
+    index, uv, _ = craters_in_view(world, exposure, 6.0)
+    assert len(index) > 5
+
+    latitude, longitude = craters.latitude_rad[index], craters.longitude_rad[index]
+    unit = np.stack(
+        [np.cos(latitude) * np.cos(longitude), np.cos(latitude) * np.sin(longitude), np.sin(latitude)], axis=1
+    )
+    focal_px = 256.0 / np.tan(np.radians(60.0))
+
+    def pixels(height_m):
+        seen = ((1_737_400.0 + height_m) * unit - position) @ rotation.T
+        plane = seen[:, :2] / seen[:, 2:]
+        return 255.5 + focal_px * plane * (1.0 - 0.02 * np.sum(plane**2, axis=1, keepdims=True))
+
+    assert uv == pytest.approx(pixels(RIM_M), abs=1e-6)
+    assert np.max(np.linalg.norm(uv - pixels(0.0), axis=1)) > 10.0

@@ -1,6 +1,4 @@
-"""Scenario files: what is read comes back, what cannot be flown is refused with the key and the values. On-board
-table of craters made from a list. Orbits of scenarios: which forces a scenario's keys switch on.
-"""
+"""Scenario files: what is read comes back, what cannot be flown is refused; orbits, craters and windows of them."""
 
 import tomllib
 from dataclasses import replace
@@ -9,13 +7,15 @@ import numpy as np
 import pytest
 
 from lunar.catalogue import CraterCatalogue
-from lunar.datafolder import find_data
-from lunar.frames import mci_from_icrf
+from lunar.datafolder import DataFolder, find_data
+from lunar.frames import mci_from_icrf, spherical_from_mcmf
 from lunar.propagation import SolarPressure
-from lunar.timescales import tdb_s_from_utc_ns
+from lunar.timescales import format_utc, tdb_s_from_utc_ns
 from payload_emulator.errors import ScenarioError
+from payload_emulator.session.archive.emulator import checked_world, emulate
 from payload_emulator.session.scenario import SHIPPED, Scenario, format_scenario, load_scenario, parse_scenario
 from payload_emulator.session.spacecraft.loading import SEEN_BELOW_RIM_M, onboard_catalogue
+from payload_emulator.session.world import world as world_module
 from payload_emulator.session.world.orbit import (
     force_model,
     initial_state_icrf,
@@ -23,6 +23,7 @@ from payload_emulator.session.world.orbit import (
     propagate_to_impact,
     sample,
 )
+from payload_emulator.session.world.world import build_world
 
 # A file with a [dataset] table is a recipe of a data set, not a scenario to fly.
 FLOWN = [file for file in sorted(SHIPPED.glob("*.toml")) if "dataset" not in tomllib.loads(file.read_text())]
@@ -34,11 +35,8 @@ def test_each_shipped_scenario_reads_and_survives_a_round_trip(file):
     assert parse_scenario(format_scenario(scenario)) == scenario
 
 
-def test_a_bare_name_means_a_shipped_scenario():
+def test_a_bare_name_means_a_shipped_scenario_and_an_empty_one_is_the_papers_orbit():
     assert load_scenario("selenita").orbit.semi_major_axis_km == 1768.180  # paper, Table I
-
-
-def test_an_empty_scenario_is_the_papers_orbit():
     assert parse_scenario('name = "x"') == Scenario(name="x")
 
 
@@ -159,14 +157,11 @@ def on_board(source, fraction=0.0):
     return onboard_catalogue(replace(scenario, navigation=navigation), measured(source))
 
 
-def test_real_craters_are_placed_below_their_rims_where_the_network_sees_them():
+def test_real_craters_are_placed_below_their_rims_where_the_network_sees_them_and_procedural_ones_on_them():
     rims = measured("LU1319381").rim_height_m
     np.testing.assert_allclose(on_board("LU1319381").rim_height_m - rims, -SEEN_BELOW_RIM_M, atol=1e-9)
     # Of the order of the measured 16 to 23 m: another sign would double the error of the altitude.
     assert 14.0 <= SEEN_BELOW_RIM_M <= 24.0
-
-
-def test_procedural_craters_are_placed_on_their_rims():
     np.testing.assert_array_equal(on_board("synthetic, seed 1").rim_height_m, measured("").rim_height_m)
 
 
@@ -225,9 +220,125 @@ def test_an_orbit_into_the_ground_is_propagated_until_then():
     )
     model = force_model(low, find_data(None))
     orbit, impact = propagate_to_impact(low, model, 30 * 86_400.0)
-    assert impact is not None
     lived_s = (impact.utc_ns - low.epoch_utc_ns) / 1e9
     assert orbit.trajectory.elapsed_s[-1] == pytest.approx(lived_s - 1.0, abs=1e-3)
     ephemeris, _ = sample(orbit, 60.0)
     assert impact.utc_ns - 61_000_000_000 < ephemeris.stop_utc_ns < impact.utc_ns
     assert propagate_to_impact(low, model, 0.5 * lived_s)[1] is None
+
+
+SCENARIO = parse_scenario("""
+name = "band"
+[dynamics]
+gravity = "builtin"
+orientation = "iau"
+[maneuvers]
+enabled = false
+[window]
+search_days = 0.5
+latitude_min_deg = -20.0
+latitude_max_deg = 50.0
+[terrain]
+source = "procedural"
+""")
+
+
+def test_frames_keep_to_the_band_of_the_window():
+    world = build_world(SCENARIO, DataFolder())
+    latitude, _, _ = spherical_from_mcmf(world.truth.positions_mcmf(world.frame_utc_ns))
+    # A frame each 15 s moves the ground point by 0.8 degrees.
+    assert np.degrees([latitude.min(), latitude.max()]) == pytest.approx([-20.0, 50.0], abs=0.9)
+    assert np.degrees(latitude.min()) >= -20.0 and np.degrees(latitude.max()) <= 50.0
+
+
+def test_a_search_without_a_window_names_the_latitudes_that_lack_terrain(monkeypatch):
+    opened = world_module.open_terrain
+
+    class Patchy:
+        def __init__(self, terrain):
+            self._terrain = terrain
+
+        def __getattr__(self, name):
+            return getattr(self._terrain, name)
+
+        def covers(self, latitude_rad, longitude_rad):
+            return np.broadcast_to(np.degrees(latitude_rad) < 30.0, np.shape(longitude_rad))
+
+    monkeypatch.setattr(world_module, "open_terrain", lambda *a, **k: Patchy(opened(*a, **k)))
+    with pytest.raises(ScenarioError, match=r"lacks terrain at latitudes (29|30|31)\.\d to (49|50)\.\d deg"):
+        build_world(SCENARIO, DataFolder())
+    south = replace(SCENARIO, window=replace(SCENARIO.window, latitude_max_deg=28.0))
+    assert build_world(south, DataFolder()).frame_utc_ns.size > 20
+
+
+def test_a_search_in_longitudes_that_no_track_crosses_says_so():
+    narrow = replace(SCENARIO.window, longitude_min_deg=10.0, longitude_max_deg=11.0)
+    with pytest.raises(ScenarioError, match=r"keeps its swath within longitudes 10\.0 to 11\.0 deg"):
+        build_world(replace(SCENARIO, window=narrow), DataFolder())
+
+
+FALLING = """
+name = "falling"
+[orbit]
+semi_major_axis_km = 1770.0
+eccentricity = 0.004
+inclination_deg = 140.0
+raan_deg = 10.0
+argument_of_perilune_deg = 0.0
+true_anomaly_deg = 60.0
+[dynamics]
+gravity = "builtin"
+orientation = "iau"
+degree = 12
+[maneuvers]
+enabled = false
+[camera]
+frame_interval_s = 60.0
+[terrain]
+source = "procedural"
+"""
+
+
+def test_a_window_before_the_impact_of_the_orbit_is_found_and_the_impact_is_named():
+    world = build_world(parse_scenario(FALLING), DataFolder())
+    assert format_utc(int(world.frame_utc_ns[0]), 0) == "2029-08-07T01:05:00Z"
+    assert world.ends.startswith("the orbit hits the Moon at 2029-08-11T15:5")
+    many = parse_scenario(f"{FALLING}[window]\npasses = 900")
+    with pytest.raises(ScenarioError, match=r"within 30\.0 days .* found \d+; the orbit hits the Moon at 2029-08-11"):
+        build_world(many, DataFolder())
+
+
+POLAR = """
+name = "pole"
+[orbit]
+semi_major_axis_km = 1770.0
+eccentricity = 0.004
+inclination_deg = 90.0
+raan_deg = 10.0
+argument_of_perilune_deg = 0.0
+true_anomaly_deg = 60.0
+[dynamics]
+gravity = "builtin"
+orientation = "iau"
+degree = 12
+[maneuvers]
+enabled = false
+[terrain]
+source = "procedural"
+[window]
+search = "none"
+latitude_limit_deg = 90.0
+start = "2029-08-07T00:05:00Z"
+duration_s = 600
+"""
+
+
+def test_a_flight_over_a_pole_is_refused_before_it_starts_by_its_first_frame_that_sees_too_far(tmp_path):
+    message = r"expected ground within 84 deg of latitude .* found 8\d\.\d+ deg needed by frame \d of 40 at 2029"
+    with pytest.raises(ScenarioError, match=message):
+        checked_world(parse_scenario(POLAR), DataFolder())
+    with pytest.raises(ScenarioError, match=message):
+        emulate(parse_scenario(POLAR), DataFolder(), tmp_path / "p")
+    assert not list(tmp_path.iterdir())
+    south = POLAR.replace("00:05:00Z", "00:40:00Z").replace("duration_s = 600", "duration_s = 300")
+    assert checked_world(parse_scenario(south), DataFolder()).frame_utc_ns.size == 20

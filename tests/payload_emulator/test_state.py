@@ -1,6 +1,4 @@
-"""Exact states: views, known objects, refusals. Stations that confirm transmissions, and the journal that a
-killed session repeats them from.
-"""
+"""Exact states: views, known objects, refusals; stations that confirm transmissions, and their journal."""
 
 import json
 import os
@@ -62,20 +60,14 @@ def test_a_value_comes_back_equal_and_of_its_type(value):
         assert found[0] is found[1]
 
 
-def test_a_value_may_contain_itself():
+def test_a_value_may_contain_itself_a_key_may_occur_again_and_random_numbers_go_on():
     value = {"list": []}
     value["list"].append(value)
     found = kept(value)
     assert found["list"][0] is found
-
-
-def test_a_key_of_a_mapping_may_occur_again():
     key = ("madrid", 1)
     value = {"by": {key: [key]}, "queue": deque([(key, b"octets")])}
     assert kept(value) == value
-
-
-def test_random_numbers_go_on():
     generator = np.random.default_rng((3, 2**41))
     generator.integers(0, 9, 7, dtype=np.uint8)
     found = kept(generator)

@@ -1,6 +1,4 @@
-"""The survey of a region: what it flies, what it counts, how it resumes. Drawn labels and contact sheets. What
-the scores of a session count, on errors made by hand.
-"""
+"""The survey of a region: what it flies, counts and resumes; labels and scores of a session."""
 
 import json
 
@@ -115,15 +113,12 @@ def test_recall_is_counted_by_size_and_by_depth_with_the_limits_in_their_groups(
     )
 
 
-def test_a_list_that_is_not_registered_is_stated_and_what_is_unknown_has_no_figure():
+def test_what_is_unknown_has_no_figure_and_a_session_without_settled_windows_is_refused():
     lone = session(window(nis=None, coast_end_m=None)).model_copy(update={"registered_share": 0.0})
     figures = summary([lone])
     assert {figures[name] for name in ("nis", "nees_trend", "coast_end_p95_m")} == {None}
     text = format_survey(figures)
     assert "not registered" in text and "NIS unknown" in text
-
-
-def test_a_session_without_settled_windows_is_refused():
     with pytest.raises(ScenarioError, match="expected windows with more than 20 frames"):
         summary([session()])
 
@@ -174,7 +169,7 @@ def label(size_class, u, inside=True):
     return {"class": size_class, "u_px": u, "v_px": 32.0, "inside": inside, "ellipse": ellipse}
 
 
-def test_classes_have_the_papers_colours_and_the_picture_is_left_alone():
+def test_classes_have_the_papers_colours_and_labels_outside_are_not_drawn():
     image = np.zeros((64, 200, 3), np.uint8)
     drawn = draw_labels(image, [label(0, 30.0), label(1, 80.0), label(2, 130.0), label(3, 180.0)])
     # The rightmost point of each circle of 20 pixels; the line is smoothed, so it may not be at full strength.
@@ -183,9 +178,6 @@ def test_classes_have_the_papers_colours_and_the_picture_is_left_alone():
     assert lime[1] > 180 and lime[0] == lime[2] == 0
     assert yellow[0] == yellow[1] > 180 and yellow[2] == 0
     assert drawn[:, 165:].max() == 0 and image.max() == 0
-
-
-def test_labels_outside_are_not_drawn_and_deep_pictures_become_eight_bits():
     image = np.full((64, 64, 3), 256 * 7 + 3, np.uint16)
     drawn = draw_labels(image, [label(0, 30.0, inside=False)])
     assert drawn.dtype == np.uint8 and (drawn == 7).all()

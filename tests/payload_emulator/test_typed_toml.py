@@ -93,7 +93,7 @@ def test_a_wrong_value_is_reported_by_place_expectation_and_finding(table, place
     assert fault.value.known == () and fault.value.nearest is None
 
 
-def test_an_unknown_key_is_reported_with_the_nearest_known_one_of_its_section():
+def test_an_unknown_key_a_missing_value_and_a_table_that_is_none_are_reported():
     with pytest.raises(TableFault) as fault:
         read_table(Outer, {"name": "a", "inner": {"lenght_m": 1.0}})
     assert (fault.value.place, fault.value.nearest) == ("inner.lenght_m", "length_m")
@@ -101,9 +101,6 @@ def test_an_unknown_key_is_reported_with_the_nearest_known_one_of_its_section():
     with pytest.raises(TableFault) as fault:
         read_table(Outer, {"name": "a", "zzz": 1.0})
     assert fault.value.place == "zzz" and fault.value.nearest is None and "count" in fault.value.known
-
-
-def test_a_missing_value_and_a_table_that_is_none_are_reported():
     with pytest.raises(TableFault, match=r"expected all of name, count, .*, found none"):
         read_table(Outer, {})
     with pytest.raises(TableFault, match="top: expected a table, found 3"):

@@ -74,7 +74,6 @@ class Tab:
 @contextmanager
 def tab(profile):
     """A browser of its own with one empty page, gone afterwards."""
-    assert CHROMIUM is not None
     process = subprocess.Popen(
         [
             CHROMIUM, "--headless", "--no-sandbox", "--disable-gpu", "--disable-dev-shm-usage",
@@ -85,7 +84,6 @@ def tab(profile):
         stderr=subprocess.PIPE,
         text=True,
     )  # fmt: skip
-    assert process.stderr is not None
     try:
         line = next(line for line in process.stderr if "DevTools listening on" in line)
         port = line.split("127.0.0.1:")[1].split("/")[0]

@@ -6,7 +6,6 @@ a single-frame fix.
 """
 
 import numpy as np
-from numpy.typing import NDArray
 
 from reports.values import (
     AnchorRead,
@@ -45,8 +44,6 @@ from reports.values import (
     TrackSeries,
     TrainingCurve,
 )
-
-Array = NDArray[np.float64]
 
 START_UTC_NS = 1_880_964_840_000_000_000  # 2029-08-09T10:14:00Z
 RADIUS_M = 1_737_400.0

@@ -15,7 +15,7 @@ from pypdf import PdfReader
 
 from reports import drawings
 from reports.document import Column, Document, Heading, Listing, Paragraph, Picture, Properties, Table
-from reports.drawings import KeptDrawings, drawing_hash
+from reports.drawings import KeptDrawings, drawing_hash, drawing_processes
 from reports.figures.theme import drawing
 from reports.html_page import html_page
 from reports.pass_report import pass_document
@@ -49,16 +49,13 @@ def document(*blocks):
     return Document("Test", "Title", "t", (), blocks)
 
 
-def test_it_is_a_pdf_of_numbered_a4_pages(octets):
+def test_it_is_a_pdf_of_numbered_a4_pages_without_date_and_machine(octets):
     reader = PdfReader(io.BytesIO(octets))
     assert len(reader.pages) > 2
     for number, page in enumerate(reader.pages, 1):
         # 210 by 297 mm are 595.3 by 841.9 points; half a point is a fifth of a millimetre.
         assert [float(v) for v in page.mediabox] == pytest.approx([0, 0, 595.3, 841.9], abs=0.5)
         assert f"{number} / {len(reader.pages)}" in page.extract_text()
-
-
-def test_no_date_and_no_machine_is_in_it(octets):
     assert b"CreationDate" not in octets and b"ModDate" not in octets
     assert PdfReader(io.BytesIO(octets)).metadata["/Title"].startswith("Pass report: ")
 
@@ -245,3 +242,20 @@ def test_an_axis_of_one_tick_shows_what_matplotlib_does():
     assert ours[0] == theirs[0] and ours[2] == theirs[2]
     assert set(ours[1]) <= set(theirs[1])  # marks of length 0 are not drawn
     assert len(ours[0]) > 8 and any("quarter" in text for text in ours[2]) and any("+1e6" in text for text in ours[2])
+
+
+def test_two_processes_draw_as_one_does(small, tmp_path, monkeypatch):
+    """What they cannot draw is left to the process that asks."""
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "kept"))
+    pictures = [one for one in pass_document(small).blocks if isinstance(one, Picture)][:3]
+    with drawing_processes(True) as processes:
+        ahead = KeptDrawings(processes)
+        ahead.prepare(pictures)
+    alone = drawings.Drawings()
+    assert [ahead[one.key] == alone.svg(one) for one in pictures] == [True] * 3
+    with drawing_processes(True) as processes:
+        assert processes.draw([replace(pictures[0], draw=lambda canvas: None)]) == []
+        assert KeptDrawings(processes).svg(pictures[0]) == ahead[pictures[0].key]
+    monkeypatch.setattr(sys, "executable", str(tmp_path / "none"))
+    with drawing_processes(True) as processes:
+        assert processes is None

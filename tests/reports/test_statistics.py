@@ -48,7 +48,7 @@ def test_the_reference_between_samples_lies_on_the_great_circle_across_the_zero_
     assert np.isnan(latitude[1]) and np.isnan(altitude[1])
 
 
-def test_ground_error_is_metres_north_and_east():
+def test_ground_error_is_metres_north_and_east_and_given_statistics_are_kept():
     # A degree of the 1737.4 km sphere is 2 pi 1737.4 / 360 = 30.3234 km; of longitude at 60 degrees, half of it.
     track = TrackSeries(np.array([0, 1]), np.full(2, 60.0), np.full(2, 359.5), np.full(2, 3e4))
     one = NavigationSeries(
@@ -57,9 +57,6 @@ def test_ground_error_is_metres_north_and_east():
     north, east = north_east_error_m(one, track)
     assert north[0] == pytest.approx(30_323.4, abs=1.0)
     assert east[0] == pytest.approx(15_161.7, abs=1.0)
-
-
-def test_statistics_given_are_kept_and_the_others_found():
     error = np.zeros((5, 3))
     error[:, 1] = [1.0, 2.0, 3.0, 4.0, np.nan]
     one = NavigationSeries(
@@ -71,12 +68,9 @@ def test_statistics_given_are_kept_and_the_others_found():
     assert np.isnan(found.drift_percent)
 
 
-def test_containment_counts_only_samples_with_a_sigma():
+def test_containment_counts_samples_with_a_sigma_and_spans_hold_their_start_only():
     assert containment(np.array([1.0, 9.0, np.nan]), np.array([1.0, 1.0, 1.0])) == 0.5
     assert np.isnan(containment(np.array([1.0]), np.array([np.nan])))
-
-
-def test_spans_hold_their_start_and_not_their_end():
     assert inside(np.array([9, 10, 19, 20]), [TimeSpan(10, 20)]).tolist() == [False, True, True, False]
 
 
@@ -93,18 +87,12 @@ def test_a_thinned_line_keeps_its_extremes_and_its_gaps():
     assert np.all(np.diff(few_x) > 0)
 
 
-def test_short_lines_are_not_thinned():
+def test_short_lines_are_not_thinned_shares_end_at_one_and_bins_of_few_samples_are_left_out():
     x = np.arange(10.0)
     assert thinned(x, x)[0] is x
-
-
-def test_cumulative_shares_end_at_one():
     value, share = cumulative(np.random.default_rng(1).normal(size=5_000), 50)
     assert len(value) <= 50 and share[-1] == 1.0
     assert np.all(np.diff(value) >= 0) and np.all(np.diff(share) > 0)
-
-
-def test_bins_without_enough_samples_are_left_out():
     found = binned(np.array([0.5] * 6 + [1.5] * 2), np.arange(8.0), np.array([0.0, 1.0, 2.0]))
     assert found.centre.tolist() == [0.5]
     assert found.median[0] == 2.5 and found.count.tolist() == [6]
@@ -117,31 +105,22 @@ def test_bin_edges_hold_all_values(low, high):
     assert len(edges) <= 11
 
 
-def test_running_mean_bridges_gaps_and_keeps_its_length():
+def test_a_running_mean_bridges_gaps_and_runs_have_their_labels():
     smooth = running_mean(np.array([1.0, np.nan, 3.0, np.nan, np.nan, np.nan]), 3)
     assert len(smooth) == 6
     assert smooth[1] == 2.0 and np.isnan(smooth[5])
     assert len(running_mean(np.zeros(2), 9)) == 2
-
-
-def test_runs_of_labels():
     assert runs(("a", "a", "b", "a")) == [(0, 2, "a"), (2, 3, "b"), (3, 4, "a")]
     assert runs(()) == []
 
 
-def test_time_ticks_are_round_and_inside():
+def test_ticks_are_round_and_inside_a_label_names_both_days_and_only_long_spans_are_zoomed():
     start = 1_880_964_840_000_000_000  # 2029-08-09T10:14:00Z
     places, labels = TimeScale(start, start + 2_220_000_000_000).ticks()
     assert labels == ["10:15", "10:20", "10:25", "10:30", "10:35", "10:40", "10:45", "10:50"]
     assert places[0] == 60.0
-
-
-def test_the_label_of_an_axis_over_midnight_names_both_days():
     start = 1_880_964_840_000_000_000
     assert TimeScale(start, start + 86_400_000_000_000).label() == "UTC, 9–10 August 2029"
-
-
-def test_only_long_spans_are_zoomed():
     start = 1_880_964_840_000_000_000
     assert zoom_span(TimeScale(start, start + 2_220_000_000_000), ()) is None
     day = TimeScale(start, start + 86_400_000_000_000)

@@ -32,21 +32,12 @@ def after_headers(count):
     return [(PERIOD + 8) * k + 8 for k in range(count)]
 
 
-def test_the_marker_is_that_of_the_standard():
+def test_every_cadu_of_a_stream_is_found_wherever_it_begins_and_none_in_noise():
     assert bytes.fromhex("1ACFFC1D") == ASM
-
-
-def test_every_cadu_of_an_undamaged_stream_is_found():
     stream = stream_of(50)
     assert find_period(stream) == PERIOD
     assert starts(stream) == list(range(0, 50 * PERIOD, PERIOD))
-
-
-def test_a_stream_may_begin_and_end_anywhere():
     assert starts(stream_of(50)[77:-5]) == [PERIOD * k - 77 for k in range(1, 49)]
-
-
-def test_nothing_and_noise_have_no_cadus():
     assert starts(np.empty(0, dtype=np.uint8)) == []
     noise = noise_of(100_000, 1)
     assert (find_period(noise), starts(noise)) == (0, [])
@@ -65,34 +56,22 @@ def test_damaged_markers_are_passed_over_while_in_lock_and_turn_no_frame(wrong_b
     assert (sync.marker_errors[which] == wrong_bits).all() and not sync.inverted.any()
 
 
-def test_lost_octets_cost_the_frame_they_are_lost_from():
+def test_lost_octets_cost_their_frame_and_inserted_ones_markers_and_outages_none():
     stream = np.delete(stream_of(20), slice(7 * PERIOD + 60, 7 * PERIOD + 63))
     sync = synchronise(stream, PERIOD)
     assert sync.offsets.tolist() == PLACES[:7] + [at - 3 for at in PLACES[8:]]
     assert sync.truncated.tolist() == [7 * PERIOD]
-
-
-def test_inserted_octets_are_skipped():
     stream = np.insert(stream_of(20), 7 * PERIOD, np.zeros(5, dtype=np.uint8))
     assert starts(stream) == PLACES[:7] + [at + 5 for at in PLACES[7:]]
-
-
-def test_a_marker_inside_a_frame_does_not_catch_the_lock():
     stream = stream_of(20)
     stream[5 * PERIOD + 40 : 5 * PERIOD + 44] = MARKER
     assert starts(stream) == PLACES
     # not even in search: the check one period later fails
     assert starts(stream[5 * PERIOD + 10 :]) == [PERIOD * k - 10 for k in range(1, 15)]
-
-
-def test_a_long_outage_is_bridged():
     noise = noise_of(100_001, 9)
     stream = np.concatenate((stream_of(5), noise, stream_of(5, seed=2)))
     after = 5 * PERIOD + noise.size
     assert starts(stream) == [PERIOD * k + gap for gap in (0, after) for k in range(5)]
-
-
-def test_a_single_cadu_is_a_stream():
     assert starts(stream_of(1)) == [0]
 
 
@@ -109,16 +88,13 @@ def test_a_stream_that_begins_within_an_octet_is_found_and_aligned(slip):
     assert cadu_octets(octets, sync).tolist() == stream.reshape(-1, PERIOD)[1:].tolist()
 
 
-def test_a_bit_slip_costs_one_frame_and_the_rest_is_read_shifted():
+def test_a_bit_slip_costs_one_frame_and_an_inverted_stretch_is_turned_upright():
     stream = stream_of(20)
     octets, sync = sync_of_bits(np.delete(np.unpackbits(stream), 8 * (7 * PERIOD + 60)))
     rows = [k for k in range(20) if k != 7]
     assert sync.start_bits.tolist() == [8 * PERIOD * k - (k > 7) for k in rows]
     assert sync.truncated.tolist() == [PERIOD * 7]
     assert cadu_octets(octets, sync).tolist() == stream.reshape(-1, PERIOD)[rows].tolist()
-
-
-def test_an_inverted_stretch_is_turned_upright():
     stream = stream_of(20)
     turned = stream.copy()
     turned[8 * PERIOD : 15 * PERIOD] ^= 0xFF
@@ -127,13 +103,10 @@ def test_an_inverted_stretch_is_turned_upright():
     assert cadu_octets(turned, sync).tolist() == stream.reshape(-1, PERIOD).tolist()
 
 
-def test_a_header_before_each_cadu_is_passed_over():
+def test_headers_and_gaps_between_cadus_are_passed_over_and_weak_markers_bridged():
     stream = stream_of(20).reshape(-1, PERIOD)
     recorded = np.hstack((np.zeros((20, 8), dtype=np.uint8), stream)).reshape(-1)
     assert starts(recorded) == after_headers(20)
-
-
-def test_gaps_of_any_length_between_cadus_are_passed_over():
     rng = np.random.default_rng(11)
     stream = stream_of(30).reshape(-1, PERIOD)
     parts, expected, at = [], [], 0
@@ -143,9 +116,6 @@ def test_gaps_of_any_length_between_cadus_are_passed_over():
         expected.append(at + gap.size)
         at += gap.size + PERIOD
     assert starts(np.concatenate(parts)) == expected
-
-
-def test_markers_of_a_weak_stretch_are_bridged_by_the_fly_wheel():
     stream = stream_of(30).reshape(-1, PERIOD)
     stream[10:16, :4] = noise_of((6, 4), 3)
     assert starts(stream.reshape(-1)) == list(range(0, 30 * PERIOD, PERIOD))
@@ -187,16 +157,13 @@ def test_likenesses_of_a_marker_in_the_headers_of_records_do_not_catch_the_lock(
     assert not sync.inverted.any()
 
 
-def test_a_valid_frame_is_preferred_to_an_undamaged_likeness_that_others_follow():
+def test_a_likeness_that_others_follow_or_in_the_last_frame_does_not_cost_a_valid_frame():
     header = np.concatenate((MARKER, np.zeros(4, dtype=np.uint8)))
     frames = stream_of(12).reshape(-1, PERIOD)
     frames[:, 3] ^= 0b00000101
     stream = np.hstack((np.tile(header, (12, 1)), frames)).reshape(-1)
     expected = after_headers(12)
     assert starts(stream, verify=lambda sync: np.isin(sync.offsets, expected), record_octets=8) == expected
-
-
-def test_a_likeness_in_the_last_frame_does_not_cost_the_frame():
     stream = stream_of(3)
     stream[2 * PERIOD + 60 : 2 * PERIOD + 64] = MARKER ^ np.uint8([0, 0, 0, 7])
     # the stream goes on for most of a frame, whose marker and the rest are damaged

@@ -1,8 +1,4 @@
-"""A dictionary written down and read again. Effects of telecommands: stated for all, inherited by scheduling
-telecommands, most severe if unknown. Texts of event values: what operators read in place of codes. Arguments
-of telecommands by name, with units and ranges. Estimates of the filter in packets of old payloads (lower
-triangle) and of today (upper triangle).  Thumbnails: the octets, and what is refused.
-"""
+"""A dictionary written down and read again: effects, texts, arguments, covariances and thumbnails."""
 
 import ast
 import io
@@ -137,20 +133,14 @@ def detections(count, rng):
     return {"frame_number": 9, "image_ticks": 1 << 40, "image_quality": "ok", "items": items}
 
 
-def test_items_may_be_given_as_mappings_or_as_arrays():
+def test_items_are_mappings_arrays_or_none_and_a_large_sigma_saturates_below_the_code_for_unknown():
     values = detections(4, np.random.default_rng(1))
     rows = [{k: v[n].item() for k, v in values["items"].items()} for n in range(4)]
     assert pack("detections", {**values, "items": rows}) == pack("detections", {**values, "count": 4})
-
-
-def test_a_packet_without_items_is_a_packet():
     _, values = DICTIONARY.unpack(pack("detections", {**detections(0, np.random.default_rng(0)), "items": []}))
     assert values["count"] == 0 and values["items"]["u_px"].size == 0
     table = tables_of(pack("detections", {"frame_number": 1, "image_ticks": 1, "image_quality": 0}))["detections"]
     assert len(table) == 1 and table.item_owner.size == 0
-
-
-def test_unknown_sigma_is_nan_and_large_sigma_saturates_below_the_code_for_unknown():
     values = detections(3, np.random.default_rng(0))
     values["items"]["sigma_px"] = np.array([np.nan, 100.0, 0.5])
     _, back = DICTIONARY.unpack(pack("detections", values))
@@ -304,7 +294,7 @@ def test_a_dictionary_that_defines_a_packet_twice_is_refused():
         Dictionary(1, (definition, definition))
 
 
-def test_a_column_is_made_once_when_it_is_asked_for():
+def test_a_column_is_made_once_when_it_is_asked_for_and_integers_do_not_wrap():
     buffer = pack("housekeeping", HOUSEKEEPING) + pack("detections", detections(2, np.random.default_rng(0)))
     tables = tables_of(buffer)
     assert set(tables) == {"housekeeping", "detections"}
@@ -312,9 +302,6 @@ def test_a_column_is_made_once_when_it_is_asked_for():
     assert list(columns) == [f.name for f in DICTIONARY.packet("housekeeping").fields]
     assert columns["mode"] is columns["mode"]
     assert set(columns._made) == {"mode"}
-
-
-def test_integer_columns_do_not_wrap_in_arithmetic():
     table = tables_of(pack("housekeeping", HOUSEKEEPING))["housekeeping"]
     assert table.columns["frames_bad"].dtype == np.int64 and table.raw["frames_bad"].dtype == np.uint32
     assert table.columns["mode"].dtype == np.int64
@@ -336,15 +323,12 @@ def test_unsigned_integers_of_64_bits_stay_what_was_sent(value):
     assert dictionary.unpack(octets)[1]["items"]["item"].tolist() == [value, 7]
 
 
-def test_limits_tell_warning_from_alarm():
+def test_limits_tell_warning_from_alarm_and_a_dictionary_survives_being_written_down():
     field = DICTIONARY.packet("housekeeping").field
     values = [-41.0, -30.0, -20.0, 20.0, 60.0, 61.0, 86.0, math.nan]
     found = limit_states(field("temperature_c"), values).tolist()
     assert found == [ALARM, WARNING, 0, 0, 0, WARNING, ALARM, WITHIN_LIMITS]
     assert limit_states(field("mode"), [3]).tolist() == [WITHIN_LIMITS]
-
-
-def test_a_dictionary_survives_being_written_down_and_reads_packets_of_today():
     again = parse_dictionary(format_dictionary(DICTIONARY))
     names = ("version", "hash", "telemetry", "telecommands")
     assert all(getattr(again, name) == getattr(DICTIONARY, name) for name in names)
@@ -380,20 +364,14 @@ def carried(octets):
     return {"release_ticks": 1, "items": [{"octet": octet} for octet in octets]}
 
 
-def test_every_telecommand_and_every_function_has_an_effect_with_a_reason_and_nothing_else_has():
+def test_every_telecommand_function_and_parameter_has_one_effect_with_a_reason():
     names = {one.name for one in DICTIONARY.telecommands} - {FUNCTION, CARRIER}
     functions = {f"{FUNCTION}/{name}" for _, name in FUNCTIONS}
     assert set(EFFECTS) == names | functions
     assert all(one.reason and one.subject == subject for subject, one in EFFECTS.items())
-
-
-def test_a_parameter_and_the_table_that_holds_it_have_the_same_effect():
     part = {"transaction": 1, "part": 1, "table": "parameters", "items": [{"octet": 0}]}
     assert effect("set_parameter", parameter_id=1, value=1.0) == effect("uplink_first", **part)
     assert effect("set_parameter", parameter_id=1, value=1.0) is Effect.CHANGES_STATE
-
-
-def test_a_function_has_its_effect_by_name_and_by_code():
     for name, code, expected in (
         ("set_mode", 1, Effect.CHANGES_STATE), ("start_observation", 2, Effect.ROUTINE),
         ("reboot", 7, Effect.DESTROYS_DATA), ("synchronise_clock", 9, Effect.CHANGES_STATE),
@@ -401,13 +379,10 @@ def test_a_function_has_its_effect_by_name_and_by_code():
         assert effect(FUNCTION, **function(name)) is effect(FUNCTION, **function(code)) is expected
 
 
-def test_an_activity_has_the_effect_of_what_it_carries_however_deep():
+def test_an_activity_has_the_effect_of_what_it_carries_or_the_gravest_if_that_is_not_known():
     for name, expected in (("start_observation", Effect.ROUTINE), ("reboot", Effect.DESTROYS_DATA)):
         once = carried(packed(FUNCTION, function(name)))
         assert effect(CARRIER, **once) is effect(CARRIER, **carried(packed(CARRIER, once))) is expected
-
-
-def test_what_carries_no_telecommand_and_what_is_not_known_counts_as_the_gravest():
     assert effect(CARRIER, **carried(b"\x00" * 12)) is Effect.DESTROYS_DATA
     for name, arguments in ((FUNCTION, {"function_id": 999}), ("new_command", {})):
         assert effect_of(DICTIONARY, name, arguments, b"").effect is Effect.DESTROYS_DATA

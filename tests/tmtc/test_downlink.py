@@ -1,4 +1,4 @@
-"""The whole chain, packets to CADUs and back, under every setting and every injury."""
+"""The whole chain, packets to CADUs and back, under every setting and every injury; control words of a downlink."""
 
 import functools
 
@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from spacepackets.ccsds.tm_frame import TmTransferFrame
+from spacepackets.ccsds.tm_frame import TmFramePrimaryHeader, TmTransferFrame
 
 from tmtc.dictionary.payload import DICTIONARY
 from tmtc.downlink import (
@@ -18,10 +18,21 @@ from tmtc.downlink import (
     decode,
     encode_cadus,
 )
-from tmtc.errors import LinkFormatError, ValueRefused
+from tmtc.errors import ChecksumError, FrameError, LinkFormatError, TruncatedPacket, ValueRefused
 from tmtc.link.cadu import ASM
-from tmtc.link.frames import Clcw, pack_clcw, randomise, unpack_clcw
-from tmtc.packets.space_packets import PacketSequencer, append_crc, pack_packet
+from tmtc.link.frames import (
+    Clcw,
+    append_frame_checksums,
+    frame_checksums_hold,
+    frame_headers,
+    idle_data,
+    pack_clcw,
+    randomise,
+    sequence,
+    unpack_clcw,
+    uplink_seen,
+)
+from tmtc.packets.space_packets import PacketSequencer, append_crc, check_crc, crc16, pack_packet
 
 # Packet of the altimeter that the payload had until commit 7787a11f, from a recording.
 WITHDRAWN = bytes.fromhex(
@@ -104,12 +115,9 @@ def test_every_reed_solomon_setting_is_found_out(errors, dual_basis, interleave)
     assert packets_of(decoded) == sent()
 
 
-def test_a_cadu_of_the_default_link_is_1279_octets():
+def test_a_cadu_of_the_default_link_is_1279_octets_and_its_frame_what_spacepackets_reads():
     octets = encode_cadus(sent()[:1], spacecraft_id=76)
     assert len(octets) == 1279 and octets[:4] == ASM
-
-
-def test_frames_are_what_spacepackets_reads():
     octets = encode_cadus(
         sent()[:40], spacecraft_id=76, virtual_channel=2, coding="none", randomiser="none", frame_length=512
     )
@@ -121,20 +129,14 @@ def test_frames_are_what_spacepackets_reads():
     assert stream.startswith(b"".join(sent()[:40]))
 
 
-def test_a_file_of_bare_packets_is_recognised():
+def test_bare_packets_are_recognised_an_empty_file_is_empty_and_long_packets_span_frames():
     decoded = read(b"".join(sent()))
     assert decoded.settings is None and decoded.frames is None
     assert decoded.packets == len(sent()) and decoded.complete
     assert decoded.by_apid == {0xA0: 20, 0xA1: 200, 0xA4: 200}
-
-
-def test_an_empty_file_is_empty():
     decoded = read(b"")
     assert (decoded.packets, decoded.octets_skipped, decoded.frame_count) == (0, 0, 0)
     assert encode_cadus([], spacecraft_id=1) == b""
-
-
-def test_packets_longer_than_frames_span_them():
     packets = [stranger_of(0x7A, 5000), *sent()[:3]]
     assert packets_of(read(encode_cadus(packets, spacecraft_id=1, frame_length=223))) == packets
 
@@ -148,14 +150,11 @@ def test_the_last_frame_is_filled_exactly_however_little_is_left(spare):
     assert decoded.octets_skipped == 0 and decoded.octets["idle_packets"] in (0, spare, spare + 215)
 
 
-def test_counts_go_on_from_one_dump_to_the_next_and_past_255():
+def test_counts_go_on_from_dump_to_dump_and_virtual_channels_are_rebuilt_apart():
     encoder = DownlinkEncoder(76, LinkSettings(frame_length=64, coding="none"))
     decoded = read(b"".join(encoder.encode(sent()[k : k + 7]) for k in range(0, len(sent()), 7)))
     assert decoded.frame_count > 256 and decoded.frames_lost == 0
     assert packets_of(decoded) == sent()
-
-
-def test_virtual_channels_are_rebuilt_apart_and_idle_frames_are_counted():
     encoder = DownlinkEncoder(76)
     octets = b""
     for k in range(0, len(sent()), 20):
@@ -213,16 +212,13 @@ def test_a_lost_frame_costs_the_packets_that_touch_it_and_no_other():
     assert decoded.sequence.missing == len(hit)
 
 
-def test_frames_that_come_twice_or_late_are_not_lost():
+def test_frames_that_come_twice_or_late_are_not_lost_and_uncorrectable_ones_located():
     octets = cadus()
     frames = [octets[k : k + 1279] for k in range(0, len(octets), 1279)]
     again = frames[:20] + frames[:10] + frames[20:40] + frames[5:15] + frames[40:]
     late = frames[:10] + frames[12:20] + frames[10:12] + frames[20:]
     lost = [read(b"".join(one)).frames_lost for one in (again, late, late[:30] + late[33:] + late[:5])]
     assert lost == [0, 0, 3]
-
-
-def test_an_uncorrectable_frame_is_counted_and_its_damage_located():
     octets = bytearray(cadus())
     octets[5 * 1279 + 10 : 5 * 1279 + 10 + 17 * 5 : 5] = bytes(17)
     decoded = read(bytes(octets))
@@ -230,7 +226,7 @@ def test_an_uncorrectable_frame_is_counted_and_its_damage_located():
     assert (decoded.frames.corrected[5] < 0).sum() == 1
 
 
-def test_correctable_errors_cost_nothing_and_are_counted():
+def test_correctable_errors_cost_nothing_are_counted_and_may_be_in_every_codeword():
     octets = bytearray(cadus())
     for frame in (1, 3):
         for k in range(16 * 5):  # sixteen errors in each of the five codewords
@@ -239,9 +235,6 @@ def test_correctable_errors_cost_nothing_and_are_counted():
     assert packets_of(decoded) == sent()
     assert decoded.symbols_corrected == 160 and decoded.complete
     assert decoded.frames.corrected[[1, 3]].tolist() == [[16] * 5] * 2
-
-
-def test_a_stream_whose_every_codeword_has_errors_is_still_recognised():
     octets = bytearray(encode_cadus(sent()[:60], spacecraft_id=76, randomiser="long"))
     for at in range(0, len(octets), 1279):
         octets[at + 300 : at + 305] = octets[at + 400 : at + 405] = bytes(5)
@@ -250,15 +243,12 @@ def test_a_stream_whose_every_codeword_has_errors_is_still_recognised():
     assert decoded.settings.randomiser == "long"
 
 
-def test_a_bad_frame_checksum_discards_the_frame_of_an_uncoded_link():
+def test_frames_with_a_bad_checksum_or_of_another_spacecraft_are_not_used():
     octets = bytearray(cadus(coding="none"))
     octets[3 * 1119 + 500] ^= 1
     decoded = read(bytes(octets))
     assert decoded.frames_bad == 1 and decoded.frames.verdict[3] == FRAME_BAD_CHECKSUM
     assert decoded.crc_errors == 0 and decoded.sequence.missing > 0
-
-
-def test_frames_of_another_spacecraft_are_not_used():
     other = encode_cadus(make_packets(3, seed=9), spacecraft_id=77)
     octets = cadus() + other
     decoded = read(octets)
@@ -267,7 +257,7 @@ def test_frames_of_another_spacecraft_are_not_used():
     assert read(octets, spacecraft_id=77).packets == len(make_packets(3, seed=9))
 
 
-def test_attaching_in_mid_stream_gives_no_bogus_packet_and_loses_no_whole_one():
+def test_attaching_in_mid_stream_or_frame_and_truncation_cost_no_whole_frame():
     # the first frames begin with the rest of a packet whose head was never received
     decoded = read(cadus()[3 * 1279 :])
     found = packets_of(decoded)
@@ -276,13 +266,7 @@ def test_attaching_in_mid_stream_gives_no_bogus_packet_and_loses_no_whole_one():
     assert len(found) == int(np.count_nonzero(starts[:-1] >= 3 * 1107))
     assert decoded.octets["orphaned"] == starts[len(sent()) - len(found)] - 3 * 1107
     assert decoded.crc_errors == 0
-
-
-def test_attaching_in_mid_frame_costs_only_that_frame():
     assert read(cadus()[777:]).octets["unsynchronised"] == 1279 - 777
-
-
-def test_a_truncated_downlink_gives_all_whole_frames():
     decoded = read(cadus()[: 7 * 1279 + 600])
     assert decoded.frame_count == 7 and decoded.octets["unsynchronised"] == 600
     found = packets_of(decoded)
@@ -303,22 +287,16 @@ def test_a_dump_that_comes_twice_is_duplicates_and_late_playback_and_a_reboot_le
     assert {account.boot for account in found.accounts} == {1, 2}
 
 
-def test_packets_outside_the_dictionary_are_counted_as_unknown():
+def test_unknown_packets_are_counted_given_settings_used_and_markers_without_frames_an_error():
     stranger = stranger_of(0x55, 28)
     decoded = read(b"".join([*sent()[:5], stranger, WITHDRAWN, *sent()[5:]]))
     assert decoded.unknown == 2 and not decoded.complete
     assert decoded.by_apid[0x55] == decoded.by_apid[0x0AE] == 1
     assert WITHDRAWN in set(packets_of(decoded))
-
-
-def test_markers_without_frames_between_them_are_an_error_that_says_so():
     noise = np.random.default_rng(3).integers(0, 256, (30, 700), dtype=np.uint8)
     noise[:, :4] = np.frombuffer(ASM, dtype=np.uint8)
     with pytest.raises(LinkFormatError, match="mostly 700 octets apart"):
         read(noise.tobytes())
-
-
-def test_settings_that_are_given_are_used():
     wrong = read(cadus(), settings=LinkSettings(randomiser="none", dual_basis=False))
     assert wrong.packets == 0 and wrong.frames_bad == wrong.frame_count
 
@@ -378,3 +356,135 @@ def test_any_octets_at_all_are_decoded_or_refused(octets):
             read(octets, settings=given_settings)
         except LinkFormatError:
             continue
+
+
+HEADERS = (
+    # version 00, spacecraft 0001001100, channel 010, OCF 1 | 5 | 6 | flags 000, segment length id 11, pointer 10
+    ("04C5 05 06 180A", (0, 76, 2, 5, 6, 10, True, False)),
+    ("3FFF FF FF DFFF", (0, 1023, 7, 255, 255, 2047, True, True)),
+    ("C000 00 00 1800", (3, 0, 0, 0, 0, 0, False, False)),
+)
+FIELDS = (
+    "version", "spacecraft_id", "virtual_channel", "master_count", "channel_count", "first_header_pointer", "ocf",
+    "secondary_header",
+)  # fmt: skip
+
+
+def test_headers_are_those_of_the_standard_and_of_spacepackets_and_checksums_hold_until_a_flip():
+    frames = np.frombuffer(bytes.fromhex("".join(octets for octets, _ in HEADERS)), dtype=np.uint8).reshape(3, 6)
+    columns = frame_headers(frames)
+    for k, name in enumerate(FIELDS):
+        assert getattr(columns, name).tolist() == [values[k] for _, values in HEADERS], name
+    octets = bytes.fromhex("04C5 05 06 180A")
+    theirs = TmFramePrimaryHeader.unpack(octets)
+    ours = frame_headers(np.frombuffer(octets, dtype=np.uint8).reshape(1, 6))
+    assert (theirs.master_channel_id.spacecraft_id, theirs.vc_id) == (ours.spacecraft_id[0], ours.virtual_channel[0])
+    assert (theirs.master_ch_frame_count, theirs.vc_frame_count) == (ours.master_count[0], ours.channel_count[0])
+    assert theirs.frame_datafield_status.first_header_pointer == ours.first_header_pointer[0]
+    frames = np.random.default_rng(0).integers(0, 256, (5, 100), dtype=np.uint8)
+    append_frame_checksums(frames)
+    assert frame_checksums_hold(frames).all()
+    frames[3, 50] ^= 1
+    assert frame_checksums_hold(frames).tolist() == [True, True, True, False, True]
+
+
+@pytest.mark.parametrize(
+    "clcw", [Clcw(0, 0), Clcw(63, 255, True, True, True, True, True, 3, 7), Clcw(5, 17, lockout=True, farm_b_counter=2)]
+)
+def test_command_link_control_words_come_back(clcw):
+    assert unpack_clcw(pack_clcw(clcw)) == clcw
+
+
+def test_control_words_idle_data_and_checksums_are_those_of_the_standard():
+    # type 0, version 00, status 000, COP 01 | VC 000101, spare 00 |
+    # no RF 0, no lock 0, lockout 1, wait 0, retransmit 1, FARM-B 10, spare 0 | 17
+    assert pack_clcw(Clcw(5, 17, lockout=True, retransmit=True, farm_b_counter=2)) == bytes.fromhex("01142C11")
+    with pytest.raises(FrameError):
+        unpack_clcw(b"\xff\xff\xff\xff")
+    # 1 + D + D^2 + D^22 + D^32: thirty-two ones, then the sum of taps
+    data = idle_data(1100)
+    assert data[:5].hex() == "ffffffff6d"
+    bits = np.unpackbits(np.frombuffer(data, dtype=np.uint8)).astype(int)
+    n = np.arange(32, bits.size)
+    assert np.array_equal(bits[n], (bits[n - 1] + bits[n - 2] + bits[n - 22] + bits[n - 32]) % 2)
+    # CRC-16/IBM-3740, the "CRC-16/CCITT-FALSE" of ECSS-E-ST-70-41C annex B: check value of "123456789"
+    assert crc16(b"123456789") == 0x29B1
+
+
+# ECSS-E-ST-70-41C annex B.1.5 (verification of compliance)
+@pytest.mark.parametrize("row", ["0000 1D0F", "000000 CC9C", "ABCDEF01 04A2", "1456F89A0001 7FD5"])
+def test_the_checksum_agrees_with_the_vectors_of_the_standard(row):
+    data, checksum = map(bytes.fromhex, row.split())
+    assert crc16(data) == int.from_bytes(checksum, "big")
+
+
+def test_a_checksum_leaves_no_remainder_and_a_wrong_one_is_reported_with_both_values():
+    octets = append_crc(b"any octets")
+    assert crc16(octets) == 0
+    check_crc(octets, "test")
+    with pytest.raises(ChecksumError, match="expected checksum 0x29B1, found 0x0000"):
+        check_crc(b"123456789\0\0", "test")
+    with pytest.raises(TruncatedPacket):
+        check_crc(b"\0", "test")
+
+
+SEQUENCES = {
+    # CCSDS 131.0-B-3 section 9.4.2: first 40 bits of the 255-bit sequence; more octets from its register
+    "legacy": ("FF480EC09A0D70BC8E2C", 255),
+    # CCSDS 131.0-B-5 section 10: first 40 bits of the 131071-bit sequence
+    "long": ("1C71B91BA9", 131_071),
+    # CCSDS 231.0-B section 6: first 40 bits of the telecommand sequence
+    "telecommand": ("FF399E5A68", 255),
+}
+
+
+@pytest.mark.parametrize("name", SEQUENCES)
+def test_sequences_begin_as_the_standards_print_them_and_repeat_after_their_full_period_only(name):
+    start, bits = SEQUENCES[name]
+    assert sequence(name, len(start) // 2).tobytes().hex().upper() == start
+    stream = np.unpackbits(sequence(name, (2 * bits + 7) // 8 + 1))
+    assert np.array_equal(stream[:bits], stream[bits : 2 * bits])
+    assert np.count_nonzero(stream[:bits]) == (bits + 1) // 2  # a maximal sequence has one more one than zeros
+    for divisor in (3, 5, 17):
+        if bits % divisor == 0:
+            assert not np.array_equal(stream[: bits - bits // divisor], stream[bits // divisor : bits])
+
+
+@pytest.mark.parametrize("name", ["none", "legacy", "long", "telecommand"])
+def test_randomising_twice_gives_the_frames_back(name):
+    frames = np.random.default_rng(0).integers(0, 256, (3, 1275), dtype=np.uint8)
+    assert np.array_equal(randomise(randomise(frames, name), name), frames)
+
+
+def test_an_unknown_randomiser_is_refused():
+    with pytest.raises(LinkFormatError, match="expected one of none, legacy, long, telecommand, found 'xyz'"):
+        sequence("xyz", 4)
+
+
+TYPE_TWO_REPORT = 0x8000_0001
+
+
+def words(*clcws):
+    return np.array(
+        [one if isinstance(one, int) else int.from_bytes(pack_clcw(one), "big") for one in clcws], dtype=np.uint32
+    )
+
+
+def test_stretches_and_channels_of_control_words_add_up_and_others_are_passed_over():
+    locked = Clcw(0, 7, lockout=True, retransmit=True, farm_b_counter=2)
+    (seen,) = uplink_seen(words(Clcw(0, 7), Clcw(0, 7), locked, locked, Clcw(0, 8, farm_b_counter=3)))
+    assert (seen.frames, seen.changes) == (5, 2)
+    assert (seen.frames_lockout, seen.frames_retransmit, seen.frames_wait, seen.frames_no_rf) == (2, 2, 0, 0)
+    assert (seen.report_value, seen.farm_b_counter, seen.lockout) == (8, 3, False)
+    seen = uplink_seen(words(Clcw(3, 1), 0, Clcw(0, 9), TYPE_TWO_REPORT, Clcw(3, 2), Clcw(0, 9)))
+    found = [(one.virtual_channel, one.frames, one.changes, one.report_value) for one in seen]
+    assert found == [(0, 2, 0, 9), (3, 2, 1, 2)]
+    assert uplink_seen(words(0, TYPE_TWO_REPORT)) == () == uplink_seen(words())
+    rng = np.random.default_rng(5)
+    for _ in range(50):
+        stream = words(*(Clcw(0, int(n), lockout=bool(n == 1)) for n in rng.integers(0, 3, 60)))
+        first, last = sorted(rng.choice(np.arange(1, 60), 2, replace=False).tolist())
+        (whole,), (head,), (tail,), (both,) = (
+            uplink_seen(part) for part in (stream, stream[:last], stream[first:], stream[first:last])
+        )
+        assert head.followed_by(both, sign=-1).followed_by(tail) == whole

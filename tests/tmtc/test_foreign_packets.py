@@ -1,8 +1,12 @@
-"""Packets without error control and with other secondary headers, compared with readers of other projects."""
+"""Packets without error control, with other headers, and in damaged streams; packets exported as tables."""
 
+import csv
+import functools
 import io
+import json
 import logging
 import struct
+import sys
 from dataclasses import replace
 
 import numpy as np
@@ -12,10 +16,22 @@ from hypothesis import strategies as st
 from spacepackets.ccsds import CdsShortTimestamp, PacketId, PacketType
 from spacepackets.ccsds.spacepacket import parse_space_packets
 
+from tests.lazy import Lazy
 from tests.tmtc.foreign import bus_like, capture, comparison, container, floating, integer, space_packet
-from tmtc.downlink import decode, encode_cadus
-from tmtc.errors import ValueRefused
-from tmtc.packets.space_packets import append_crc, idle_packet
+from tests.tmtc.test_downlink import make_packets
+from tmtc.dictionary.payload import DICTIONARY
+from tmtc.downlink import (
+    FRAME_GOOD,
+    FRAME_UNCHECKED,
+    DownlinkEncoder,
+    LinkSettings,
+    decode,
+    encode_cadus,
+    propose_settings,
+)
+from tmtc.errors import LinkFormatError, MissingLibrary, UnknownPacket, ValueRefused
+from tmtc.export import format_onboard_time, format_records, packet_records, parquet_octets
+from tmtc.packets.space_packets import append_crc, idle_packet, pack_packet
 from tmtc.packets.stream import UNCHECKED, PacketForm, cut_packets, find_prefix
 from tmtc.xtce.decode import Decoder
 from tmtc.xtce.importing import parse_xtce
@@ -145,11 +161,8 @@ def test_a_hole_costs_the_packets_it_touches(seed):
     assert packets_of(octets[:start] + octets[stop:]) == packets[:first] + packets[whole_again:]
 
 
-def test_a_header_alone_at_the_end_proves_nothing():
+def test_headers_alone_at_the_end_or_out_of_their_counts_are_no_packets():
     assert packets_of(b"\xff" * 100 + space_packet(5, b"abc", 0)) == []
-
-
-def test_headers_that_do_not_continue_the_counts_of_their_apid_are_no_packets():
     packets = [space_packet(9, b"abc", k) for k in range(20)]
     headers = space_packet(9, b"\xff" * 30, 9000) + space_packet(9, b"\xff" * 30, 4000)
     noise = b"\xff" * 20 + headers + b"\xff" * 5
@@ -157,15 +170,12 @@ def test_headers_that_do_not_continue_the_counts_of_their_apid_are_no_packets():
     assert found == packets[:9] + packets[10:]
 
 
-def test_a_wrong_length_costs_its_packet():
+def test_a_wrong_length_a_missing_beginning_and_end_cost_no_more_than_their_packets():
     packets = capture(100, 2)
     broken = bytearray(packets[50])
     broken[4:6] = struct.pack(">H", len(broken) + 100)
     found = packets_of(b"".join([*packets[:50], bytes(broken), *packets[51:]]))
     assert found == packets[:50] + packets[51:]
-
-
-def test_a_beginning_and_an_end_that_are_missing_cost_no_more_than_their_packets():
     packets = capture(60, 3)
     octets = b"".join(packets)
     assert packets_of(octets[5:]) == packets[1:]
@@ -221,13 +231,10 @@ def test_every_octet_of_anything_is_accounted_for(octets, ends):
     assert total == len(mixed)
 
 
-def test_idle_packets_are_distinguished_from_the_others():
+def test_idle_packets_are_distinguished_and_pieces_are_refused_without_error_control():
     packets = [space_packet(9, bytes((k,)), k) for k in range(10)]
     found = cut(b"".join(p + idle_packet(20) for p in packets))
     assert len(found) == 10 and found.octets_idle == 200
-
-
-def test_pieces_of_a_stream_are_refused_without_error_control():
     with pytest.raises(ValueRefused, match="final"):
         cut_packets(b"abc", form=UNCHECKED, final=False)
 
@@ -240,15 +247,12 @@ def check(decoded, packets):
     assert decoded.sequence.gaps == decoded.sequence.missing == 0
 
 
-def test_packets_without_error_control_are_taken_out_of_frames():
+def test_packets_without_error_control_are_taken_out_of_frames_except_lost_ones():
     packets = capture(400, 7)
     octets = encode_cadus(packets, spacecraft_id=42)
     check(decode(octets, form=UNCHECKED), packets)
     uncoded = encode_cadus(packets, spacecraft_id=42, coding="none", frame_length=223)
     check(decode(uncoded, form=UNCHECKED), packets)
-
-
-def test_a_lost_frame_costs_the_packets_that_are_in_it():
     packets = capture(400, 8)
     octets = encode_cadus(packets, spacecraft_id=42)
     size = 1279
@@ -258,3 +262,231 @@ def test_a_lost_frame_costs_the_packets_that_are_in_it():
     starts = [0, *ends[:-1]]
     kept = [p for p, a, b in zip(packets, starts, ends, strict=True) if b <= 5 * zone or a >= 6 * zone]
     assert list(decoded.cut.packets(decoded.buffer)) == kept and decoded.frames_lost == 1
+
+
+parquet = Lazy("pyarrow.parquet")
+
+STATE = {f.name: [0.0] * 3 if f.size > 1 else 1 for f in DICTIONARY.packet("navigation_state").fields}
+
+
+def tables():
+    items = {
+        "u_px": [1.5, 2.0], "v_px": [3.0, 4.0], "diameter_px": [10.0, 20.0], "score": [1.0, 0.0],
+        "size_class": [0, -1], "sigma_px": [0.5, np.nan],
+    }  # fmt: skip
+    detections = {"frame_number": 1, "image_ticks": 7, "image_quality": "dark"}
+    event = {"event_id": "boot", "frame_number": 0, "value_1": 0.25, "value_2": np.nan}
+    state = STATE | {"velocity_icrf_m_s": [1.0, 2.0, 3.0], "sigma_rtn_m": [4.0, 5.0, np.nan]}
+    octets = b"".join(
+        (
+            DICTIONARY.pack("event_info", event, ticks=0, sequence_count=0),
+            DICTIONARY.pack("detections", {**detections, "items": items}, ticks=3 << 15, sequence_count=0),
+            DICTIONARY.pack("detections", {**detections, "items": []}, ticks=2 << 16, sequence_count=1),
+            DICTIONARY.pack("navigation_state", state, ticks=2 << 16, sequence_count=0),
+        )
+    )
+    return DICTIONARY.unpack_many(octets, cut_packets(octets))
+
+
+def test_json_and_csv_hold_the_records_in_order_with_names_and_times_and_no_packets_are_none():
+    assert format_onboard_time(0) == "2000-01-01T00:00:00.000000"
+    # 2029-08-07T00:00:00 TAI is 10811 days after the epoch
+    assert format_onboard_time(10811 * 86400 << 16 | 0x8000) == "2029-08-07T00:00:00.500000"
+    assert format_onboard_time((1 << 48) - 1).startswith("2136-02-07T06:28:15.99998")
+    records = packet_records(tables())
+    assert [r["packet"] for r in records] == ["event_info", "detections", "detections", "navigation_state"]
+    assert records[0]["event_id"] == "boot" and records[0]["value_2"] is None
+    assert records[1]["image_quality"] == "dark" and records[1]["onboard_tai"].endswith("00:00:01.500000")
+    rows = [list(item.values()) for item in records[1]["items"]]
+    assert rows == [[1.5, 3.0, 10.0, 1.0, "5-10 km", 0.5], [2.0, 4.0, 20.0, 0.0, "none", None]]
+    assert list(records[1]["items"][0]) == ["u_px", "v_px", "diameter_px", "score", "size_class", "sigma_px"]
+    assert records[2]["items"] == []
+    assert records[3]["sigma_rtn_m"] == [4.0, 5.0, None]
+    records = packet_records(tables())
+    assert json.loads(format_records(records, "json")) == records
+    rows = list(csv.DictReader(io.StringIO(format_records(records, "csv").decode())))
+    assert [row["frame_number"] for row in rows] == ["0", "1", "1", "1"]
+    assert rows[3]["velocity_icrf_m_s_2"] == "2.0" and rows[3]["sigma_rtn_m_3"] == ""
+    assert json.loads(rows[1]["items"]) == records[1]["items"]
+    assert json.loads(format_records([], "json")) == []
+    assert format_records([], "csv") == b"\n"
+    with pytest.raises(UnknownPacket, match="expected one of json, csv, parquet, found 'xml'"):
+        format_records([], "xml")
+
+
+def read_parquet(octets):
+    return parquet.read_table(io.BytesIO(octets))
+
+
+def test_parquet_columns_keep_values_and_gaps_truths_as_integers_and_stay_without_rows():
+    table = read_parquet(parquet_octets({"n": [1, None, -3], "x": [0.5, 1, None], "t": ["a", None, "\u00b5"]}))
+    assert table.to_pydict() == {"n": [1, None, -3], "x": [0.5, 1.0, None], "t": ["a", None, "\u00b5"]}
+    assert [str(field.type) for field in table.schema] == ["int64", "double", "string"]
+    assert read_parquet(parquet_octets({"b": [True, None, np.True_.item(), False]})).to_pydict() == {
+        "b": [1, None, 1, 0]
+    }
+    assert read_parquet(parquet_octets({"n": [], "t": []})).column_names == ["n", "t"]
+
+
+def test_parquet_without_its_library_says_what_to_install(monkeypatch):
+    monkeypatch.setitem(sys.modules, "pyarrow", None)
+    with pytest.raises(MissingLibrary, match=r"expected the library pyarrow, found none; install linna\[parquet\]"):
+        parquet_octets({"n": [1]})
+
+
+def test_unsigned_integers_of_64_bits_are_written_whole():
+    state = STATE | {"image_ticks": 2**64 - 1}
+    octets = DICTIONARY.pack("navigation_state", state, ticks=0, sequence_count=0)
+    records = packet_records(DICTIONARY.unpack_many(octets, cut_packets(octets)))
+    assert json.loads(format_records(records, "json"))[0]["image_ticks"] == 18446744073709551615
+    rows = list(csv.DictReader(io.StringIO(format_records(records, "csv").decode())))
+    assert rows[0]["image_ticks"] == "18446744073709551615"
+    assert read_parquet(format_records(records, "parquet")).column("image_ticks").to_pylist() == [2**64 - 1]
+
+
+def test_parquet_integers_stay_exact_and_records_are_its_rows():
+    table = read_parquet(parquet_octets({"u": [0, None, 2**64 - 1], "both": [-1, 2**63, 5]}))
+    assert table.to_pydict() == {"u": [0, None, 2**64 - 1], "both": ["-1", "9223372036854775808", "5"]}
+    assert [str(field.type) for field in table.schema] == ["uint64", "string"]
+    records = packet_records(tables())
+    table = read_parquet(format_records(records, "parquet"))
+    assert table.num_rows == len(records)
+    assert table.column("apid").to_pylist() == [record["apid"] for record in records]
+
+
+SETTINGS = LinkSettings()
+ZONE = 1115 - 6 - 2
+
+
+@functools.cache
+def sent():
+    return make_packets(1500, seed=5)
+
+
+@functools.cache
+def cadus():
+    """Return the undamaged stream, one CADU per row."""
+    octets = encode_cadus(sent(), spacecraft_id=76)
+    return np.frombuffer(octets, dtype=np.uint8).reshape(-1, SETTINGS.cadu_length)
+
+
+def with_bit_errors(rows, rate, seed):
+    bits = np.unpackbits(rows.reshape(-1))
+    wrong = np.random.default_rng(seed).random(bits.size) < rate
+    return np.packbits(bits ^ wrong).reshape(rows.shape)
+
+
+def packets_within(received):
+    """Return the packets whose frames were all received."""
+    edges = np.cumsum([0, *map(len, sent())])
+    spans = zip(sent(), edges[:-1] // ZONE, (edges[1:] - 1) // ZONE + 1, strict=True)
+    return [packet for packet, first, after in spans if received.issuperset(range(first, after))]
+
+
+def check_stream(stream, expected, **options):
+    octets = stream.tobytes()
+    decoded = decode(octets, **options)
+    assert set(decoded.cut.packets(decoded.buffer)) == set(expected)
+    assert sum(decoded.octets.values()) == len(octets) and min(decoded.octets.values()) >= 0
+    return decoded
+
+
+@pytest.mark.parametrize("weak", [20, 100, 180])
+def test_weak_frames_at_the_start_hide_neither_the_settings_nor_the_rest(weak):
+    rows = cadus().copy()
+    rows[:weak] = with_bit_errors(rows[:weak], 1.5e-2, seed=weak)
+    known = decode(rows.tobytes(), settings=SETTINGS)
+    decoded = check_stream(rows, list(known.cut.packets(known.buffer)))
+    assert decoded.settings == propose_settings(cadus()).settings
+    assert set(packets_within(set(range(weak, len(rows))))) <= set(decoded.cut.packets(decoded.buffer))
+    assert decoded.frame_count == len(rows) and decoded.frames_bad > weak * 0.8
+
+
+@pytest.mark.parametrize("octets", [77_000, 79_000, 3_000_000])
+def test_noise_before_the_first_frame_hides_nothing(octets):
+    noise = np.random.default_rng(octets).integers(0, 256, octets, dtype=np.uint8)
+    decoded = check_stream(np.concatenate((noise, cadus().reshape(-1))), sent())
+    assert decoded.octets["unsynchronised"] == octets
+
+
+@pytest.mark.parametrize("rate", [0.0, 2e-3])
+def test_a_station_header_before_each_frame_is_distinguished_from_the_frame(rate):
+    header = np.random.default_rng(8).integers(0, 256, (len(cadus()), 8), dtype=np.uint8)
+    decoded = check_stream(np.hstack((header, with_bit_errors(cadus(), rate, seed=9))), sent())
+    assert decoded.settings.coding == "rs"
+    assert (decoded.symbols_corrected > 0) == (rate > 0)
+
+
+def test_gaps_of_any_length_between_frames_cost_nothing():
+    rng = np.random.default_rng(10)
+    parts = []
+    for row in cadus():
+        parts += [rng.integers(0, 256, int(rng.integers(0, 60)), dtype=np.uint8), row]
+    check_stream(np.concatenate(parts), sent())
+
+
+@pytest.mark.parametrize("rate, seed", [(2e-2, 0), (3e-2, 1)])
+def test_frames_that_no_code_can_repair_are_never_good(rate, seed):
+    rows = with_bit_errors(cadus()[:60], rate, seed)
+    with pytest.raises(LinkFormatError, match="no valid frame"):
+        decode(rows.tobytes())
+    known = decode(rows.tobytes(), settings=SETTINGS)
+    assert not (known.frames.verdict == FRAME_GOOD).any()
+
+
+def test_a_frame_without_code_and_checksum_is_unchecked_and_never_good():
+    octets = encode_cadus(sent(), spacecraft_id=76, coding="none", checksum=False)
+    decoded = decode(octets)
+    assert decoded.packets == len(sent())
+    assert set(decoded.frames.verdict.tolist()) == {FRAME_UNCHECKED}
+    assert decoded.accounting()["frames_unchecked"] == decoded.frame_count
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_noise_is_never_a_frame_or_a_packet(seed):
+    noise = np.random.default_rng(seed).integers(0, 256, 20_000, dtype=np.uint8).tobytes()
+    found = decode(noise)
+    assert found.packets == 0 and found.frame_count == 0
+    known = decode(noise, settings=SETTINGS)
+    assert known.packets == 0
+    assert not (known.frames.verdict == FRAME_GOOD).any()
+
+
+def test_frames_of_several_receivers_in_any_order_give_every_packet():
+    n = len(cadus())
+    any_order = (np.random.default_rng(seed).permutation(n) for seed in range(3))
+    for order in (np.repeat(np.arange(n), 2), np.r_[1:n:2, 0:n:2], *any_order):
+        decoded = check_stream(cadus()[order], sent())
+        assert (decoded.frames_lost, decoded.sequence.missing, decoded.sequence.conflicts) == (0, 0, 0)
+    rng = np.random.default_rng(12)
+    n = len(cadus())
+    first, second = (np.flatnonzero(rng.random(n) > 0.15) for _ in range(2))
+    received = set(first.tolist()) | set(second.tolist())
+    decoded = check_stream(np.concatenate((cadus()[first], cadus()[second])), packets_within(received))
+    assert decoded.frames_lost <= n - len(received)
+    long = append_crc(pack_packet(0x55, bytes(range(256)) * 24, sequence_count=3)[:-2])
+    octets = DownlinkEncoder(5, LinkSettings(frame_length=223)).encode([*sent()[:3], long, *sent()[3:6]])
+    rows = np.frombuffer(octets, dtype=np.uint8).reshape(-1, 259)
+    mixed = np.concatenate((rows[:5], rows[9:14], rows[4:10], rows[14:], rows[2:7]))
+    decoded = decode(mixed.tobytes())
+    assert long in set(decoded.cut.packets(decoded.buffer))
+    assert sum(decoded.octets.values()) == mixed.size
+
+
+def test_bit_slips_cost_only_the_frames_they_hit_and_an_inverted_stream_is_read():
+    slips = [9 * 8 * 1279 + 4000, 50 * 8 * 1279 + 77, 100 * 8 * 1279 + 9000]
+    stream = np.packbits(np.delete(np.unpackbits(cadus().reshape(-1)), slips))
+    received = set(range(len(cadus()))) - {9, 50, 100}
+    decoded = check_stream(stream, packets_within(received))
+    assert decoded.frames_bad == 3
+    check_stream(255 - cadus(), sent())
+
+
+def test_foreign_packets_are_not_ordered_by_a_time_they_do_not_carry():
+    # the 14th octet is that of a CUC time of the dictionary, the six octets behind it count down
+    octets = b""
+    for k in range(50):
+        data = bytes(7) + b"\x2e" + (10**6 - k).to_bytes(6, "big") + bytes(10)
+        octets += append_crc(pack_packet(0x123, data, sequence_count=k, secondary_header=True)[:-2])
+    decoded = decode(octets)
+    assert (decoded.packets, decoded.sequence.gaps, decoded.sequence.missing) == (50, 0, 0)

@@ -57,22 +57,16 @@ def test_a_telecommand_of_spacepackets_is_read_and_equal_to_ours():
     )  # fmt: skip
 
 
-def test_headers_come_back():
+def test_headers_come_back_with_their_request_id_and_another_version_is_refused():
     telemetry = TmSecondaryHeader(255, 255, (1 << 48) - 1, 65535, 65535, 15)
     assert unpack_tm_header(pack_tm_header(telemetry)) == telemetry
     telecommand = TcSecondaryHeader(255, 255, 15, 65535)
     assert unpack_tc_header(pack_tc_header(telecommand)) == telecommand
-
-
-def test_headers_of_another_pus_version_are_refused():
     for unpack in (unpack_tm_header, unpack_tc_header):
         with pytest.raises(MalformedPacket, match="expected PUS version 2, found 1"):
             unpack(b"\x10" + bytes(13))
     with pytest.raises(TruncatedPacket):
         unpack_tm_header(bytes(13))
-
-
-def test_the_request_id_is_the_packet_id_and_sequence_control():
     packet = DICTIONARY.pack_command("test_connection", {}, sequence_count=0x123)
     assert request_id(packet) == 0x18A0C123
     assert SpacePacketHeader.unpack(packet[:6]).packet_id.raw() == 0x18A0
@@ -107,14 +101,11 @@ def test_damaged_headers_are_refused():
         unpack_primary_header(b"\xff" * 6)
 
 
-def test_idle_packets_have_the_idle_apid_and_no_secondary_header():
+def test_idle_packets_have_the_idle_apid_and_counts_of_each_apid_wrap_at_14_bits():
     header = unpack_primary_header(idle_packet(7))
     assert (header.apid, header.secondary_header, header.packet_length) == (0x7FF, False, 7)
     with pytest.raises(ValueRefused):
         idle_packet(6)
-
-
-def test_sequence_counts_wrap_at_14_bits_separately_for_each_apid():
     sequencer = PacketSequencer()
     counts = [sequencer.next(1) for _ in range(16386)]
     assert counts[:2] == [0, 1] and counts[16383:] == [16383, 0, 1]
@@ -164,21 +155,15 @@ def test_order_and_repetition_do_not_matter():
     assert receiver._kept == 0
 
 
-def test_a_number_that_is_used_again_for_another_table_begins_again():
+def test_a_number_begins_again_transfers_are_bounded_and_impossible_parts_are_refused():
     old = list(through_packets(split(IMAGE, transaction=3, table="thumbnail", part_length=5000)))
     new = list(through_packets(split(IMAGE[::-1], transaction=3, table="landmark_map", part_length=5000)))
     assert received([old[0], *new]) == [LargeData(3, 7, IMAGE[::-1])]
-
-
-def test_unfinished_transfers_do_not_grow_without_bound():
     receiver = LargeDataReceiver(most_octets=5000)
     for transaction in range(100):
         name, values = split(IMAGE, transaction=transaction, table=1, part_length=1000)[0]
         receiver.accept(name, values)
         assert receiver._kept <= 5000
-
-
-def test_impossible_parts_are_refused():
     with pytest.raises(ValueRefused):
         split(IMAGE, transaction=1, table=1, part_length=0)
     with pytest.raises(ValueRefused, match="at most 65535 parts"):

@@ -26,16 +26,13 @@ def independent(errors):
     return reedsolo.RSCodec(nsym=2 * errors, nsize=255, fcr=128 - errors, prim=0x187, generator=173)
 
 
-def test_the_generator_polynomial_is_that_of_the_standard():
+def test_the_generator_polynomial_and_the_dual_basis_are_those_of_the_standard():
     # CCSDS 131.0-B annex: palindromic, E = 16; coefficients as published with libfec
     half = "015B7F56101E0DEB61A5082A3656AB20"
     assert bytes(generator(16)).hex().upper() == half + "71" + "".join(
         half[k : k + 2] for k in range(len(half) - 2, -1, -2)
     )
     assert len(generator(8)) == 17 and generator(8) == generator(8)[::-1]
-
-
-def test_the_dual_basis_table_is_that_of_the_standard():
     to_dual, from_dual = dual_basis_tables()
     assert to_dual[:8].tobytes().hex().upper() == "007BAFD499E2364D"
     assert [int(to_dual[1 << bit]) for bit in range(8)] == [0x7B, 0xAF, 0x99, 0xFA, 0x86, 0xEC, 0xEF, 0x8D]
@@ -50,21 +47,15 @@ def test_conventional_codewords_are_those_of_an_independent_encoder(errors):
     assert encode(frame, code).tobytes() == bytes(theirs)
 
 
-def test_dual_codewords_are_conventional_ones_symbol_by_symbol():
+def test_dual_codewords_interleaving_and_virtual_fill_are_symbol_by_symbol_those_of_the_standard():
     to_dual, from_dual = dual_basis_tables()
     dual, conventional = ReedSolomon(interleave=1), ReedSolomon(interleave=1, dual_basis=False)
     frames = frames_for(dual)
     assert np.array_equal(encode(frames, dual), to_dual[encode(from_dual[frames], conventional)])
-
-
-def test_symbol_k_of_a_codeblock_belongs_to_codeword_k_modulo_the_depth():
     code, single = ReedSolomon(interleave=5), ReedSolomon(interleave=1)
     blocks = encode(frames_for(code), code)
     for k in range(5):
         assert clean(np.ascontiguousarray(blocks[:, k::5]), single).all()
-
-
-def test_virtual_fill_is_leading_zeros_that_are_not_sent():
     short, full = ReedSolomon(interleave=1, virtual_fill=23), ReedSolomon(interleave=1)
     frames = frames_for(short)
     padded = np.pad(frames, ((0, 0), (23, 0)))
@@ -144,13 +135,10 @@ def test_repair_agrees_with_an_independent_decoder_up_to_and_beyond_its_power(er
     assert np.array_equal(data[corrected >= 0, : 255 - 2 * errors], frames[corrected >= 0])
 
 
-def test_noise_is_uncorrectable():
+def test_noise_is_uncorrectable_and_no_blocks_are_no_frames():
     noise = np.random.default_rng(8).integers(0, 256, (300, 255), dtype=np.uint8)
     # by the count of codewords within reach, 1 word of noise in 16! = 2e13 decodes with E = 16
     assert (repair(noise, ReedSolomon(interleave=1))[1] == UNCORRECTABLE).all()
-
-
-def test_no_blocks_are_no_frames():
     code = ReedSolomon()
     assert decode(np.empty((0, 1275), dtype=np.uint8), code).frames.shape == (0, 1115)
     assert encode(np.empty((0, 1115), dtype=np.uint8), code).shape == (0, 1275)

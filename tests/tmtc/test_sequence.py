@@ -21,16 +21,13 @@ def report(counts, ticks=None, apid=None, same=always_same, boot=None):
     return account(apid, counts % 16384, ticks, same, boot)
 
 
-def test_unbroken_counts_have_no_gap_across_any_number_of_wraps():
+def test_counts_have_no_gap_across_wraps_and_a_missing_packet_is_one():
     for counts in (range(100), range(16380, 16390), range(50_000)):
         result = report(counts)
         assert (result.gaps, result.missing, result.duplicates, result.conflicts) == (0, 0, 0, 0)
         assert result.accounts[0].received == len(counts)
         assert result.extended_count.tolist() == list(counts)
     assert report([]).accounts == ()
-
-
-def test_a_missing_packet_is_one_gap_also_across_the_wrap():
     for counts, missing in (([0, 1, 2, 4, 5], [3, 3]), ([16382, 16383, 16386, 16387], [16384, 16385])):
         result = report(counts)
         assert (result.gaps, result.missing) == (1, missing[1] - missing[0] + 1)
@@ -48,19 +45,13 @@ def test_order_of_arrival_does_not_matter():
     assert shuffled.extended_count.tolist() == counts[order].tolist()
 
 
-def test_packets_of_equal_time_are_ordered_by_their_count():
+def test_what_comes_twice_is_a_duplicate_other_octets_a_conflict_and_equal_times_go_by_count():
     # four estimators report in one instant, arriving in any order, across the wrap
     assert report([16381, 16382, 0, 16383, 2, 1], ticks=[0, 0, 1, 1, 1, 1]).gaps == 0
-
-
-def test_a_packet_that_comes_twice_is_a_duplicate_and_other_octets_are_a_conflict():
     assert report([0, 1, 1, 2], ticks=[0, 1, 1, 2]).verdict.tolist() == [FIRST, FIRST, DUPLICATE, FIRST]
     conflict = report([0, 1, 1, 2], ticks=[0, 1, 1, 2], same=never_same)
     assert conflict.verdict.tolist() == [FIRST, FIRST, CONFLICT, FIRST]
     assert (conflict.duplicates, conflict.conflicts) == (0, 1)
-
-
-def test_a_whole_dump_that_comes_twice_is_duplicates_and_no_gap():
     counts = np.r_[:500, :500]
     result = report(counts, ticks=counts << 16)
     assert (result.duplicates, result.gaps, result.accounts[0].received) == (500, 0, 500)
@@ -84,34 +75,25 @@ def test_a_burst_from_the_future_leaves_no_gap_behind():
     assert report(counts, ticks).gaps == 0
 
 
-def test_interleaved_senders_are_accounted_apart():
+def test_senders_and_boots_are_accounted_apart():
     apid = np.tile([1, 2], 50)
     counts = np.repeat(np.arange(50), 2)
     result = report(counts, apid=apid)
     assert result.gaps == 0 and [a.received for a in result.accounts] == [50, 50]
-
-
-def test_boots_are_accounted_apart():
     counts = np.r_[:100, :100]
     boot = np.repeat([7, 8], 100)
     result = report(counts, boot=boot, same=never_same)
     assert [(a.boot, a.received, a.gaps, a.conflicts) for a in result.accounts] == [(7, 100, 0, 0), (8, 100, 0, 0)]
 
 
-def test_a_counter_that_begins_again_is_a_restart_and_no_gap():
+def test_a_counter_that_begins_again_is_a_restart_without_hiding_losses():
     counts = np.r_[3000:3100, :50]
     result = report(counts)
     assert (result.accounts[0].restarts, result.gaps, result.conflicts, result.duplicates) == (1, 0, 0, 0)
-
-
-def test_losses_before_and_after_a_restart_are_still_losses():
     counts = np.r_[3000:3100, :50]
     result = report(np.delete(counts, [50, 120]))
     # The second run counts on from 16,384.
     assert result.accounts[0].missing_ranges.tolist() == [[3050, 3050], [16_404, 16_404]]
-
-
-def test_a_count_that_falls_to_less_than_64_by_more_than_64_is_a_restart():
     for before, after, restarts in ((3000, 63, 1), (3000, 64, 0), (115, 50, 1), (114, 50, 0)):
         result = report([before, after])
         assert result.accounts[0].restarts == restarts, (before, after)

@@ -40,24 +40,18 @@ def assert_every_octet_is_accounted_for(octets, cut):
     assert np.all(ranges[1:, 0] == ranges[:-1, 1])
 
 
-def test_an_undamaged_stream_gives_all_its_packets_in_order():
+def test_a_stream_gives_all_its_packets_in_order_also_with_stray_octets():
     cut = cut_to(WHOLE, PACKETS)
     assert (cut.crc_errors, cut.octets_skipped, cut.octets_idle) == (0, 0, 0)
-
-
-def test_nothing_gives_nothing():
     cut = cut_packets(b"")
     assert len(cut) == 0 and cut.consumed == 0
-
-
-# the injuries that other decoders were measured with: 3 stray octets, a flipped bit, a wrong length, a cut end
-
-
-def test_three_stray_octets_cost_no_packet():
     octets = inserted(b"\x01\x02\x03")
     cut = cut_to(octets, PACKETS)
     assert cut.skipped.tolist() == [[AT_500, AT_500 + 3]]
     assert cut.crc_errors == 0
+
+
+# the injuries that other decoders were measured with: 3 stray octets, a flipped bit, a wrong length, a cut end
 
 
 @pytest.mark.parametrize(
@@ -85,13 +79,10 @@ def test_a_wrong_length_field_costs_the_one_packet(change):
     assert cut.octets_skipped + cut.lengths[~cut.crc_ok].sum() == len(PACKETS[500])
 
 
-def test_a_stream_that_ends_in_mid_packet_gives_all_that_are_whole():
+def test_a_stream_that_begins_or_ends_in_mid_packet_loses_only_that_one():
     octets = WHOLE[: AT_500 + 11]
     cut = cut_to(octets, PACKETS[:500])
     assert cut.skipped.tolist() == [[AT_500, AT_500 + 11]]
-
-
-def test_a_stream_that_is_joined_in_mid_packet_loses_only_that_one():
     octets = WHOLE[7:]
     cut = cut_to(octets, PACKETS[1:])
     assert cut.octets_skipped == len(PACKETS[0]) - 7
@@ -122,42 +113,30 @@ def test_a_damaged_packet_that_holds_a_whole_packet_does_not_give_birth_to_it():
     assert cut.crc_errors == 1
 
 
-def test_idle_packets_are_counted_and_not_given():
+def test_idle_packets_are_counted_and_not_given_and_those_of_the_other_type_are_none():
     octets = idle_packet(7) + inserted(idle_packet(300)) + idle_packet(12)
     cut = cut_to(octets, PACKETS)
     assert (cut.octets_idle, cut.octets_skipped) == (319, 0)
-
-
-def test_an_idle_header_among_stray_octets_does_not_swallow_packets():
     # claims 65542 octets, far more than any damage: the packets "inside" it must come out
     octets = inserted(b"\x07\xff\xc0\x00\xff\xff")
     cut_to(octets, PACKETS)
-
-
-def test_packets_of_the_other_type_are_not_packets():
     command = DICTIONARY.pack_command("test_connection", {}, sequence_count=1)
     cut = cut_packets(inserted(command))
     assert len(cut) == len(PACKETS) and cut.octets_skipped == len(command)
     assert cut_packets(command, packet_type=1).lengths.tolist() == [len(command)]
 
 
-def test_noise_gives_no_packets():
+def test_noise_and_endless_headers_give_no_packets_and_hide_none():
     # 4 MB of noise hold some 500,000 places where a header could stand, eight of which a bare CRC would believe
     noise = np.random.default_rng(11).integers(0, 256, 4 << 20, dtype=np.uint8)
     cut = cut_packets(noise)
     assert int(cut.crc_ok.sum()) == 0
     assert cut.octets_skipped + cut.lengths.sum() == noise.size
-
-
-def test_octets_that_are_headers_all_along_do_not_hold_up_the_reader():
     # nine octets that claim to be a packet each, none of them one; quadratic work would take minutes here
     octets = bytes.fromhex("000000000002AAAAAA") * 100_000
     cut = cut_packets(octets)
     assert not cut.crc_ok.any()
     assert_every_octet_is_accounted_for(octets, cut)
-
-
-def test_packets_between_stretches_of_noise_are_found():
     rng = np.random.default_rng(12)
     parts = []
     for packet in PACKETS[:200]:
@@ -165,16 +144,13 @@ def test_packets_between_stretches_of_noise_are_found():
     cut_to(b"".join(parts), PACKETS[:200])
 
 
-def test_segments_are_cut_each_for_itself():
+def test_segments_are_cut_each_for_itself_and_the_longest_packet_is_one():
     # a packet must not be put together from both sides of a gap
     half = len(PACKETS[500]) // 2
     octets = WHOLE[: AT_500 + half] + WHOLE[AT_500 + half :]
     segments = np.array([[0, AT_500 + half], [AT_500 + half, len(octets)]], dtype=np.int64)
     cut = cut_to(octets, PACKETS[:500] + PACKETS[501:], segments=segments)
     assert cut.octets_skipped == len(PACKETS[500])
-
-
-def test_the_longest_packet_is_a_packet():
     packet = append_crc(pack_packet(5, bytes(65_536), sequence_count=0)[:-2])
     assert len(packet) == 65_542
     cut_to(packet + packet, [packet, packet])

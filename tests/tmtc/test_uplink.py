@@ -32,19 +32,13 @@ LONG = DICTIONARY.pack_command(
 )
 
 
-def test_the_code_block_of_the_reference_has_its_parity():
+def test_code_blocks_cltus_and_frames_are_those_of_the_standard():
     # a code block seen on other links: 22F600FF00421A with parity octet 12
     assert bch_parity(bytes.fromhex("22F600FF00421A")) == 0x12
-
-
-def test_a_cltu_has_start_code_blocks_and_tail():
     cltu = encode_cltu(bytes.fromhex("22F600FF00421A"))
     assert cltu == CLTU_START + bytes.fromhex("22F600FF00421A12") + CLTU_TAIL
     # the last block is filled with 55
     assert encode_cltu(b"\x01")[2:9] == b"\x01" + b"\x55" * 6
-
-
-def test_a_frame_has_the_bits_that_the_standard_draws():
     # version 00, bypass 1, control 0, spare 00, spacecraft 76 | channel 2, length 9 - 1 | number 5
     frame = pack_tc_frame(TcFrame(76, 2, 5, b"\xc0\x01", bypass=True))
     assert frame[:7] == bytes.fromhex("204C 0808 05 C001")
@@ -73,14 +67,11 @@ def test_what_is_sent_comes_back_long_packets_too(randomised, bypass):
     assert (decoded.octets_skipped, decoded.faults, decoded.frames) == (0, (), 11)
 
 
-def test_a_wrong_bit_in_each_code_block_is_repaired():
+def test_a_wrong_bit_of_a_block_is_repaired_and_two_lose_that_command_only():
     octets = bytearray(SENT)
     for k in range((len(octets) - 10) // 8):
         octets[2 + 8 * k + k % 8] ^= 0x80 >> k % 7  # information and parity, never the filler bit
     assert list(UplinkDecoder(76).decode(octets).packets) == FIRST
-
-
-def test_two_wrong_bits_in_a_block_lose_that_command_and_no_other():
     each = [UplinkEncoder(76).encode([command]) for command in COMMANDS]
     damaged = bytearray(each[2])
     damaged[5] ^= 0x81
@@ -89,14 +80,11 @@ def test_two_wrong_bits_in_a_block_lose_that_command_and_no_other():
     assert decoded.faults and decoded.octets_skipped > 0
 
 
-def test_what_lies_between_cltus_is_skipped():
+def test_what_lies_between_cltus_and_frames_for_another_spacecraft_are_not_used():
     octets = b"\xeb\x90\xeb\x90" + b"\x55" * 9 + SENT + b"\xaa" * 20
     decoded = UplinkDecoder(76).decode(octets)
     assert list(decoded.packets) == FIRST
     assert decoded.octets_skipped == 33
-
-
-def test_frames_for_another_spacecraft_are_not_used():
     decoded = UplinkDecoder(77).decode(SENT)
     assert decoded.packets == ()
     assert decoded.faults == ("telecommand frame: expected spacecraft 77, found 76",)
@@ -129,16 +117,13 @@ def test_a_number_far_off_locks_the_receiver_until_it_is_unlocked():
     assert decoder.farms[0].clcw.farm_b_counter == 3
 
 
-def test_a_packet_whose_first_segment_was_lost_is_not_given():
+def test_packets_without_their_first_or_last_segment_are_dropped():
     frames = UplinkEncoder(76).frames(LONG)
     decoder = UplinkDecoder(76, randomised=False)
     decoded = decoder.decode(b"".join(encode_cltu(f) for f in frames[1:]))
     assert decoded.packets == () and len(decoded.faults) == len(frames) - 1
     # the next whole one is
     assert list(decoder.decode(b"".join(encode_cltu(f) for f in frames)).packets) == [LONG]
-
-
-def test_an_unfinished_packet_is_dropped_for_the_next():
     frames = UplinkEncoder(76).frames(LONG)
     decoder = UplinkDecoder(76, randomised=False)
     stream = encode_cltu(frames[0]) + b"".join(encode_cltu(f) for f in UplinkEncoder(76).frames(COMMANDS[0]))
@@ -147,23 +132,17 @@ def test_an_unfinished_packet_is_dropped_for_the_next():
     assert decoded.faults == ("segment: expected a continuation, found the beginning of another packet",)
 
 
-def test_packets_end_where_they_say():
+def test_packets_are_cut_where_they_say_and_expedited_and_control_frames_counted():
     segment = b"\xc0" + COMMANDS[0] + COMMANDS[1] + b"\x18\xa0"
     frame = pack_tc_frame(TcFrame(76, 0, 0, segment, bypass=True))
     decoded = UplinkDecoder(76, randomised=False).decode(encode_cltu(frame))
     assert list(decoded.packets) == COMMANDS[:2]
     assert decoded.faults == ("segment: expected a packet, found 2 octets",)
-
-
-def test_the_receiver_counts_expedited_and_control_frames():
     farm = Farm()
     assert farm.accept(TcFrame(1, 0, 0, b"\xc0", bypass=True))
     assert not farm.accept(TcFrame(1, 0, 0, CONTROL_UNLOCK, bypass=True, control=True))
     assert not farm.accept(TcFrame(1, 0, 0, CONTROL_UNLOCK, control=True))
     assert farm.farm_b_counter == 2
-
-
-def test_bare_telecommand_packets_are_cut():
     octets = b"\x00" + b"".join(COMMANDS)
     assert list(cut_packets(octets, packet_type=1).packets(octets)) == COMMANDS
 

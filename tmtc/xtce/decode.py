@@ -277,11 +277,12 @@ def _join_segments(
 ) -> _Source:
     """Join the parts of segmented packets whose counts follow one another; `packets` are the first parts.
 
-    The verdict of the other parts becomes `JOINED`. A later part with a secondary header, whose length is not known,
-    is not joined.
+    The verdict of the other parts becomes `JOINED`, also that of a part that follows itself again. A later part with a
+    secondary header, whose length is not known, is not joined.
     """
     parts = np.flatnonzero(verdict == SEGMENT)
     parts = parts[np.argsort(headers.apid[parts], kind="stable")]
+    copies, origins, parts = _repeated_parts(octets, cut, headers, parts)
     apid, count, flags = headers.apid[parts], headers.sequence_count[parts], headers.sequence_flags[parts]
     follows = (apid[1:] == apid[:-1]) & (count[1:] == (count[:-1] + 1) % space_packets.SEQUENCE_COUNT_LIMIT)
     follows &= (
@@ -304,9 +305,23 @@ def _join_segments(
             pieces.append(octets[at + skipped : max(at + cut.lengths[part] - left, at + skipped)])
             size += len(pieces[-1])
         verdict[parts[start + 1 : stop]] = JOINED
+        verdict[copies[np.isin(origins, parts[start:stop])]] = JOINED
         offsets[first], lengths[first] = begin, size - begin
     joined = np.concatenate(pieces) if pieces else np.empty(0, dtype=np.uint8)
     return _Source(joined, offsets, lengths, np.sort(parts[starts[is_whole]]))
+
+
+def _repeated_parts(
+    octets: OctetArray, cut: PacketCut, headers: PrimaryHeaders, parts: IntArray
+) -> tuple[IntArray, IntArray, IntArray]:
+    """Return the parts that are equal to the one before of their APID, the first of each of these, and the others."""
+    again = np.zeros(len(parts), dtype=np.bool_)
+    same = (np.diff(headers.apid[parts]) == 0) & (np.diff(headers.sequence_count[parts]) == 0)
+    for k in np.flatnonzero(same).tolist():
+        one, other = (octets[cut.offsets[p] : cut.offsets[p] + cut.lengths[p]] for p in parts[k : k + 2])
+        again[k + 1] = np.array_equal(one, other)
+    first = np.maximum.accumulate(np.where(again, 0, np.arange(len(parts))))
+    return parts[again], parts[first[again]], parts[~again]
 
 
 def _asks_for(root: Container, bit: int, bits: int) -> bool:

@@ -28,22 +28,16 @@ def outcomes(disturbed, **given):
     return {one.name: one.outcome for one in found if one.outcome != "equal"}
 
 
-def test_figures_that_nothing_flags_are_different():
+def test_figures_are_flagged_by_events_of_their_pass_and_packets_kept_apart_and_others_different():
     assert outcomes(report(errors=(98.0, 95.001))) == {}
     assert outcomes(report(errors=(98.0, 96.0), packets=901)) == {
         f"performance.passes[{OTHER}].median_error_m": "DIFFERENT",
         "navigation.anchored.median_m": "DIFFERENT",
         "packets": "DIFFERENT",
     }
-
-
-def test_a_pass_is_flagged_by_its_own_events_and_figures_of_all_passes_with_it():
     disturbed = report(errors=(98.0, 96.0))
     assert set(outcomes(disturbed, events={OTHER: {"clock_jump"}}).values()) == {"flagged"}
     assert set(outcomes(disturbed, events={START: {"clock_jump"}}).values()) == {"DIFFERENT"}
-
-
-def test_packets_are_flagged_by_those_kept_apart_and_nothing_else_is():
     disturbed = report(packets=901, errors=(98.0, 96.0)) | {"packets_implausible": 1}
     found = outcomes(disturbed)
     assert found["packets"] == found["packets_implausible"] == "flagged"

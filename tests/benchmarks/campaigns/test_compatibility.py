@@ -23,13 +23,10 @@ def test_numbers_are_compared_in_digits_of_the_greatest_value_of_their_column(fo
     assert compare([[1.0, 1000.0], [2.0, 2000.0]], found) == (text, text.startswith("equal"))
 
 
-def test_a_quaternion_and_its_negative_are_the_same_rotation():
+def test_values_are_compared_by_name_and_a_quaternion_and_its_negative_are_the_same():
     right, other = [[0.0, 0.6, 0.0, 0.0, 0.8]], [[0.0, -0.6, 0.0, 0.0, -0.8]]
     assert compare(right, other, rotations=True) == ("equal (5 values)", True)
     assert not compare(right, other)[1]
-
-
-def test_values_of_packets_are_compared_by_name():
     right = [{"a": 1, "b": [1.5, None], "c": "ON"}]
     assert compare(right, [{"a": 1, "b": [1.5, float("nan")], "c": "ON"}]) == ("equal (4 values)", True)
     found = compare(right, [{"a": 2, "b": [1.5, None], "c": "ON"}])

@@ -6,10 +6,8 @@ import json
 import secrets
 import threading
 import time
-from collections.abc import Callable
 from contextlib import contextmanager
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
-from typing import Any
 from urllib.parse import parse_qs, urlencode, urlsplit
 
 from joserfc import jwk, jwt
@@ -22,17 +20,17 @@ class OpenIdProvider:
     """Provider in which every visitor of the sign-in page is `claims`."""
 
     def __init__(self):
-        self.claims: dict[str, Any] = {
+        self.claims = {
             "sub": "u-1", "preferred_username": "ann", "roles": ["linna-operators"], "sid": "s-1",
         }  # fmt: skip
-        self.change: Callable[[dict[str, Any]], dict[str, Any]] = lambda claims: claims
+        self.change = lambda claims: claims
         self.algorithm = "RS256"
         self.key = KEY
         self.published = [self.key]
-        self.codes: dict[str, dict[str, str]] = {}
+        self.codes = {}
         self.codes_once = True
-        self.metadata: dict[str, Any] = {}
-        self.requests: list[str] = []
+        self.metadata = {}
+        self.requests = []
         self.start()
         self.issuer = f"http://127.0.0.1:{self.port}/realms/ops"
 

@@ -2,7 +2,6 @@
 
 import asyncio
 from types import SimpleNamespace
-from typing import Any
 
 import pytest
 from fastapi.security import HTTPAuthorizationCredentials
@@ -12,7 +11,7 @@ from ground_service.access.service import LOCAL_CALLER, Caller, add_user, change
 from ground_service.errors import NotAuthorised
 from ground_service.http.problems import Forbidden
 
-NO_REQUEST: Any = None
+NO_REQUEST = None
 ROLES = ("viewer", "operator", "admin")
 
 
@@ -25,13 +24,10 @@ def bearer(token):
     return HTTPAuthorizationCredentials(scheme="Bearer", credentials=token)
 
 
-def test_without_users_an_open_service_has_a_local_caller_who_may_do_everything(ground):
+def test_without_users_an_open_service_has_a_local_caller_and_one_that_others_reach_is_closed(ground):
     asked = request(ground, True)
     assert caller_of(asked, None) == LOCAL_CALLER == Caller("local", "admin", None)
     assert vars(asked.state) == {"caller": "local"}
-
-
-def test_a_service_that_others_reach_is_closed_even_without_users(ground):
     with pytest.raises(NotAuthorised, match="expected a bearer token in the Authorization header, found none"):
         caller_of(request(ground, False), None)
 

@@ -70,15 +70,12 @@ def test_the_reference_has_its_place_over_the_turned_moon():
     assert_allclose(np.linalg.norm(track.velocity_icrf_m_s, axis=1), SPEED_M_S, atol=1e-6)
 
 
-def test_epochs_outside_the_reference_have_no_state():
+def test_epochs_outside_or_without_a_reference_or_an_orientation_have_no_state():
     track = flown(-1.0, 0.0, 601.0)
     assert track.covered.tolist() == [False, True, False]
     _, _, *names = ReferenceStates.__slots__
     for values in (getattr(track, name) for name in names):
         assert np.isnan(values[[0, 2]]).all() and np.isfinite(values[1]).all()
-
-
-def test_without_reference_or_orientation_nothing_is_covered():
     for given in ((polar(), None), (None, Turning()), (None, None)):
         track = reference_states(*given, after(0.0, 10.0))
         assert track.covered.tolist() == [False, False]
@@ -121,7 +118,7 @@ def test_an_error_of_position_is_estimate_minus_reference_and_its_place_is_found
     assert longitude[0] == pytest.approx(360.0 - math.degrees(0.06))
 
 
-def test_the_ground_path_is_the_arc_over_the_moon_that_does_not_turn_back():
+def test_the_ground_path_is_the_arc_over_the_moon_that_does_not_turn_back_also_a_quarter_round():
     """Over the still Moon 1.6 km/s at 1787.4 km; the turning ground adds 174 m/s across, less toward the pole."""
     track = flown(0.0, 10.0, 20.0, 40.0)
     path = ground_path_m(track, MOON_M)
@@ -129,9 +126,6 @@ def test_the_ground_path_is_the_arc_over_the_moon_that_does_not_turn_back():
     # The cosine of 2 degrees is 0.9994; the chords of 20 s cut off nothing that counts.
     assert_allclose(path, np.hypot(north, east) * np.array([0.0, 10.0, 20.0, 40.0]), rtol=2e-5)
     assert_allclose(ground_path_m(track, 1.0), path / MOON_M, rtol=1e-12)
-
-
-def test_a_quarter_of_the_way_round_is_a_quarter_of_the_circumference():
     place = np.array([[2e6, 0.0, 0.0], [0.0, 5e6, 0.0], [0.0, -1e6, 0.0]])
     track = replace(flown(0.0, 1.0, 2.0), position_mcmf_m=place)
     assert_allclose(ground_path_m(track, 2.0), [0.0, math.pi, 3.0 * math.pi])

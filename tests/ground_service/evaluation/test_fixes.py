@@ -1,6 +1,4 @@
-"""Fixes repeated from single frames, and classified as right or wrong, on exact projections. Landmarks of the
-payload with the catalogue.
-"""
+"""Fixes repeated from single frames and classified, on exact projections; landmarks of the payload."""
 
 import math
 from dataclasses import replace
@@ -54,21 +52,15 @@ def some(values, rows):
     return type(values)(*(getattr(values, name)[rows] for name in values.__slots__))
 
 
-def test_a_frame_gives_its_position_back_from_a_start_kilometres_off():
+def test_a_frame_gives_its_position_back_with_the_noise_of_a_pixel_and_not_from_few_craters():
     start = POSITION + np.array([[1500.0, -900.0, 700.0], [-400.0, 2500.0, 100.0]])
     solved = snapshot_positions(pairs(), CAMERA, UTC_NS, start)
     # exact projections: the residue is that of the last step, a centimetre at most
     assert np.abs(solved - POSITION).max() < 0.02
-
-
-def test_noise_of_a_pixel_moves_it_by_hundreds_of_metres_at_most():
     solved = snapshot_positions(pairs(noise_px=1.0), CAMERA, UTC_NS, POSITION + 500.0)
     error = np.linalg.norm(solved - POSITION, axis=1)
     # a pixel is 203 m at nadir from 30 km (design figure); eight craters halve it, the geometry may triple it
     assert np.all((error > 1.0) & (error < 1000.0))
-
-
-def test_too_few_craters_give_no_position():
     solved = snapshot_positions(some(pairs(), np.array([0, 1, 8, 9, 10])), CAMERA, UTC_NS, POSITION)
     assert np.isnan(solved[0]).all()
     assert np.isfinite(solved[1]).all()
@@ -180,7 +172,7 @@ def test_landmarks_are_found_in_the_catalogue_on_both_sides_of_the_meridian_with
     assert shifted.normalised_square > 3.0
 
 
-def test_what_the_catalogue_lacks_is_new_and_a_crater_serves_one_landmark_only():
+def test_a_crater_serves_one_landmark_others_are_new_and_the_last_report_counts():
     craters = catalogue()
     listed = craters.select(np.arange(0, 200, 2))
     result = compare_map(mapped(craters, 100.0), listed)
@@ -188,9 +180,6 @@ def test_what_the_catalogue_lacks_is_new_and_a_crater_serves_one_landmark_only()
     assert np.all(np.isnan(result.offset_m[result.crater < 0]))
     first = mapped(craters.select(np.array([5, 5])), 100.0)
     assert compare_map(first, craters).known == 1
-
-
-def test_the_last_report_of_a_landmark_counts():
     early, late = mapped(catalogue(4), 300.0, 3), mapped(catalogue(4), 50.0, 4)
     both = (np.concatenate([getattr(one, name) for one in (early, late)]) for name in early.__slots__)
     assert np.array_equal(latest(MappedCraters(*both)).latitude_deg, late.latitude_deg)

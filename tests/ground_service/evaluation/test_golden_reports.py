@@ -31,6 +31,7 @@ from tests.ground_service.conftest import (
     enter_files,
     event_packet,
 )
+from tests.scenarios import GOLDEN as MISSION
 from tmtc.dictionary.payload import DICTIONARY
 from tmtc.downlink import LinkSettings, encode_cadus
 from tmtc.packets.pus import TICKS_PER_SECOND
@@ -39,43 +40,6 @@ FRAMES = 12
 PACKETS_PER_FRAME = 6  # detections, two states, two outcomes, housekeeping
 DETECTIONS, STATES, OUTCOMES, HOUSEKEEPING = 0x0A1, 0x0A2, 0x0A3, 0x0A0
 HOUR_NS = 3600 * NS
-
-MISSION = """
-schema_version = 1
-name = "golden"
-[spacecraft]
-id = 76
-[frames]
-orientation = "IAU WGCCRE 2009"
-gravity_field = "GRGM1200L (12x12, built in)"
-[camera]
-pointing = "nadir"
-width_px = 512
-height_px = 512
-fov_deg = 120.0
-k1 = 0.0
-[reference]
-sigma_rtn_m = [3.0, 4.0, 0.0]
-[evidence]
-world = "real-terrain"
-unseen_share = 0.25
-[experiment]
-orbit_error_m = 1000.0
-[requirements]
-estimator = "spherical"
-median_error_m = 129.0
-p95_error_m = 131.0
-better_than = ["propagate-only"]
-packets_percent = 100.0
-frames_percent = 100.0
-images_percent = 100.0
-recall = 0.5
-precision = 0.5
-anchor_reads = 0.0
-resets = 0.0
-temperature_max_c = 21.0
-cpu_percent = 50.0
-"""
 
 
 def rows(report):

@@ -370,15 +370,12 @@ def test_the_start_state_is_propagated_with_every_field_and_from_the_reference()
     assert report.headline[1].value == approx(flown.statistics.median_3d_m)
 
 
-def test_a_start_state_as_good_as_the_reference_needs_no_perfect_one():
+def test_a_start_state_is_propagated_from_its_instant_with_a_perfect_one_if_it_is_worse():
     position, velocity = circle(0.0)
     for east_m, names in ((0.9, ["propagate-only", "Kepler"]), (1.1, [*BASELINES])):
         start = StartState(EPOCH, position + np.array([0.0, east_m, 0.0]), velocity)
         report = evaluated(start_state=start, onboard_gravity=builtin_gravity())
         assert [one.name for one in of_baselines(report)] == names
-
-
-def test_a_start_within_the_pass_is_propagated_from_there():
     state = circle(20.0)
     report = evaluated(start_state=StartState(EPOCH + 20 * SECOND, *state))
     # The first sample is 10 s after the start: no distance of two states of one instant, and no perfect start.
@@ -387,9 +384,6 @@ def test_a_start_within_the_pass_is_propagated_from_there():
     assert kepler.utc_ns.tolist() == TIMES[2:].tolist()
     assert_allclose(kepler.error_rtn_m, 0.0, atol=0.01)
     assert of_baselines(evaluated(start_state=StartState(int(TIMES[-1]) + SECOND, *state))) == []
-
-
-def test_a_sample_that_the_time_correlation_moved_before_the_start_state_is_the_same_instant():
     position, velocity = circle(0.0)
     moved = position + np.array([0.0, 1.5, 0.0])
     exact, late = (of_baselines(evaluated(start_state=StartState(EPOCH + ns, moved, velocity))) for ns in (0, 12_000))
@@ -412,7 +406,7 @@ def test_why_there_is_no_baseline(report, monkeypatch):
     assert "gravity of the baseline" not in crashed.provenance
 
 
-def test_samples_outside_the_reference_have_no_error_and_are_counted():
+def test_the_reference_is_given_at_every_sample_time_and_samples_outside_have_no_error():
     """The reference ends at 150 s; the last sample is at 165 s."""
     report = evaluated(reference=reference(150.0))
     assert report.remarks[0] == "1 of 12 sample times lie outside the reference ephemeris and have no error"
@@ -420,9 +414,6 @@ def test_samples_outside_the_reference_have_no_error_and_are_counted():
     assert np.isnan(found.error_rtn_m[-1]).all() and np.isfinite(found.error_rtn_m[:-1]).all()
     assert found.statistics.path_length_m == approx(10 * STEP_M, rel=1e-9)
     assert math.isnan(report.reference.altitude_m[-1])
-
-
-def test_the_reference_is_given_at_every_sample_time_of_any_kind():
     shifted = anchored(utc_ns=TIMES + SECOND)
     report = evaluated(navigation=(paper(), shifted))
     track = report.reference
@@ -734,7 +725,7 @@ def test_the_summary_holds_the_figures_of_the_report(report):
     }
 
 
-def test_the_summary_of_a_pass_without_figures_holds_none():
+def test_the_summary_has_no_figures_without_a_pass_and_baselines_in_their_own_place():
     report = evaluated(detections=no_detections(), navigation=(), reference=None, catalogue=None)
     empty = {
         "frames": None, "packets": 0, "packets_lost": 0, "packets_expected": 0,
@@ -743,9 +734,6 @@ def test_the_summary_of_a_pass_without_figures_holds_none():
     }  # fmt: skip
     bare = summary_of(replace(report, accounting=None, packets=None))
     assert {name: bare[name] for name in empty} == empty
-
-
-def test_baselines_have_their_own_place_in_the_summary():
     baselines = summary_of(evaluated(start_state=START))["baselines"]
     assert tuple(baselines) == BASELINES
     assert baselines["Kepler"]["max_3d_m"] > 100.0

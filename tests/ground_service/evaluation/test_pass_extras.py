@@ -1,10 +1,4 @@
-"""The ground under a pass: mare or highland, from the albedo of the Moon. Remarks of a report on the attitude,
-from events of the payload. The choice of the frames with the lowest recall. TUM text against the evaluators'
-definitions, written out here with 4 x 4 matrices. The albedo of the Moon as a picture under maps. Drift and
-statistics, on errors whose figures can be said beforehand. Consistency against values from outside: printed
-tables of the chi-square distribution, hand-computed quadratics. Projection into a tilted, distorted camera
-over high terrain, against a projection written out here.
-"""
+"""Parts of a pass report: ground, attitude, worst frames, TUM, drift, consistency, against values from outside."""
 
 import math
 from types import SimpleNamespace
@@ -158,15 +152,12 @@ def poses(text):
     return rows[:, 0], matrices
 
 
-def test_orientations_are_those_of_the_orbit():
+def test_orientations_are_those_of_the_orbit_and_times_keep_their_nanoseconds():
     _, true = poses(format_tum(UTC_NS, orbit(), orbit()))
     radial, normal = true[:, :3, 0], true[:, :3, 2]
     assert_allclose(radial, orbit() / np.linalg.norm(orbit(), axis=1)[:, None], atol=1e-9)
     # The plane of the made orbit is tilted by atan 0.1 about x.
     assert_allclose(normal, [[0.0, -0.0995037, 0.9950372]] * COUNT, atol=1e-4)
-
-
-def test_times_keep_their_nanoseconds():
     line = format_tum(UTC_NS[:2] + 123_456_789, orbit()[:2], orbit()[:2]).splitlines()[1]
     assert line.split()[0] == "1881735115.123456789"
 
@@ -207,7 +198,6 @@ def test_a_file_that_is_no_picture_is_reported(tmp_path):
 def test_a_fifth_of_the_real_moon_is_dark_and_the_sea_of_tranquillity_is(data_path):
     # Maria cover about 17 % of the Moon (Head 1976, Reviews of Geophysics 14, 265); other ground is darker.
     albedo = find_data(data_path).albedo
-    assert albedo is not None
     found = surface_map(albedo)
     limit = dark_limit(found)
     area = np.cos(np.radians(90.0 - (np.arange(1024) + 0.5) * 180.0 / 1024))[:, None] / 2048
@@ -226,7 +216,7 @@ NEVER = np.zeros(100, dtype=bool)
 STEADY = np.arange(100)[:, None] * np.array([0.0, 245.0, 0.0])
 
 
-def test_a_steady_drift_is_its_share_of_the_path_and_a_reset_hides_none():
+def test_a_drift_is_its_share_of_the_path_a_reset_hides_none_and_the_error_before_it_is_known():
     """Sawtooth: 2 % between resets, although the error at the end of the pass is nearly nothing."""
     assert drift_percent(STEADY, PATH_M, NEVER) == approx(1.0, rel=1e-12)
     height = STEADY[:, [1, 0, 2]]
@@ -234,15 +224,9 @@ def test_a_steady_drift_is_its_share_of_the_path_and_a_reset_hides_none():
     phase = np.arange(100) % 20
     sawtooth = phase[:, None] * np.array([0.0, 490.0, 0.0])
     assert drift_percent(sawtooth, PATH_M, phase == 0) == approx(2.0, rel=1e-12)
-
-
-def test_the_error_before_a_reset_is_that_of_the_sample_before():
     error = np.arange(6)[:, None] * np.array([0.0, 3.0, 4.0])
     before = error_before_reset_m(error, np.isin(np.arange(6), (0, 3)))
     assert_allclose(before, [np.nan, np.nan, np.nan, 10.0, np.nan, np.nan])
-
-
-def test_drift_by_length_crosses_no_reset():
     place = np.arange(100)
     samples = drift_by_length(STEADY * (place < 50)[:, None], PATH_M, place == 50)
     assert [sample.path_length_m for sample in samples] == [100e3, 200e3, 500e3, 1000e3]
@@ -251,7 +235,7 @@ def test_drift_by_length_crosses_no_reset():
     assert samples[0].p95_percent == approx(1.0)
 
 
-def test_statistics_leave_out_samples_without_reference():
+def test_statistics_leave_out_samples_without_reference_and_weigh_with_the_whole_matrix():
     error = np.array([[3.0, 4.0, 0.0], [np.nan] * 3, [0.0, 0.0, 10.0]])
     found = navigation_statistics(error, np.array([0.0, np.nan, 1000.0]), NEVER[:3])
     assert (found.median_3d_m, found.max_3d_m, found.end_of_pass_m, found.path_length_m) == approx(
@@ -260,9 +244,6 @@ def test_statistics_leave_out_samples_without_reference():
     for count in (0, 1):
         few = navigation_statistics(np.zeros((count, 3)), np.zeros(count), NEVER[:count])
         assert np.isnan(few.drift_percent)
-
-
-def test_a_correlated_error_is_weighted_with_the_whole_matrix():
     # P = [[4, 2], [2, 3]], inverse [[3, -2], [-2, 4]] / 8; e = (2, -1): (12 + 8 + 4) / 8 = 3. The diagonal alone gives
     # 4/4 + 1/3.
     covariance = [[4.0, 2.0], [2.0, 3.0]]
@@ -298,14 +279,11 @@ def test_what_is_not_known_is_not_guessed():
     assert np.isnan(squared_normalised_errors([[1.0, 1.0], [np.nan, 1.0]], [[0.0, 1.0], [1.0, 1.0]])).all()
 
 
-def test_no_samples_and_shapes_that_do_not_fit():
+def test_no_samples_have_no_sums_and_bounds_are_those_of_printed_tables():
     assert nees(np.zeros((0, 3)), np.zeros((0, 3, 3))).shape == (0,)
     assert nees(np.ones((4, 5, 3)), np.eye(3)).shape == (4, 5)
     with pytest.raises(ValueError, match=r"expected errors \(..., d\)"):
         nees(np.ones(3), np.eye(2))
-
-
-def test_bounds_are_those_of_printed_tables():
     # Quantiles of chi-square at 0.025 and 0.975 as tables print them (NIST/SEMATECH e-Handbook, 1.3.6.7.4).
     low, high = bounds([1, 3, 6, 100])
     assert_allclose(high, [5.024, 9.348, 14.449, 129.561], atol=6e-4)
@@ -365,7 +343,7 @@ def catalogue():
     )
 
 
-def test_a_tilted_distorted_camera_sees_craters_on_high_ground_where_they_are():
+def test_a_tilted_camera_sees_craters_on_high_ground_and_beyond_a_nadir_footprint():
     viewing = Viewing(CAMERA, TILT_RAD)
     expected = expected_craters(catalogue(), CAMERA, POSITION, viewing.pointed(POSITION))
     assert expected.index.tolist() == [0, 1, 2, 3]
@@ -373,10 +351,7 @@ def test_a_tilted_distorted_camera_sees_craters_on_high_ground_where_they_are():
     assert_allclose(found, [pixel(*place, RIM_HEIGHT_M) for place in PLACES_DEG], rtol=0, atol=1e-6)
     lost = np.full((1, 3), np.nan)
     assert len(expected_craters(catalogue(), CAMERA, lost, viewing.pointed(lost)).index) == 0
-
-
-def test_a_camera_that_leans_far_sees_craters_beyond_a_nadir_footprint():
-    """2.5 degrees north of the track is 76 km, past the corner of a nadir image from 30 km (73 km)."""
+    # 2.5 degrees north of the track is 76 km, past the corner of a nadir image from 30 km (73 km).
     far = make_catalogue(np.radians([3.0]), np.radians([0.0]), np.array([9e3]), source="made", rim_height_m=np.zeros(1))
     narrow = BrownCamera(512, 512, math.radians(60.0))
     assert len(expected_craters(far, narrow, POSITION).index) == 0

@@ -76,16 +76,13 @@ def test_a_crater_of_unknown_height_is_neither_missed_nor_a_false_alarm():
         assert (score.expected, score.detected_true, score.false_alarms) == (2, 2, 0)
 
 
-def test_a_perfect_detector_scores_one(expected):
+def test_a_perfect_detector_scores_one_and_a_second_detection_of_a_crater_is_a_false_alarm(expected):
     found = detections(expected.u_px + 0.3, expected.v_px - 0.4, expected.diameter_px, [0, 1, 2, 3])
     score = scored(found, expected)
     micro = score.micro
     assert (micro.expected, micro.detected_true, micro.false_alarms) == (3, 3, 0)
     assert micro.localisation_px == approx(0.5)
     assert_allclose(score.residuals.du_px, 0.3)
-
-
-def test_one_detection_serves_one_crater_and_the_second_is_a_false_alarm(expected):
     twice = [1, 1]
     found = detections(expected.u_px[twice] + [0.0, 2.0], expected.v_px[twice], expected.diameter_px[twice], twice)
     middle = scored(found, expected).per_class[1]

@@ -27,7 +27,6 @@ from lunar.timescales import parse_utc, tdb_s_from_utc_ns
 from payload_emulator.flight.navigation.filter.filter import CommonErrors
 from tests.payload_emulator.flight.test_dynamics import start_state
 
-Arrays = tuple[np.ndarray, np.ndarray]
 EPOCH = parse_utc("2029-08-07T00:00:00Z")
 START_S = float(tdb_s_from_utc_ns(EPOCH))
 STEP_S, STATES = 60.0, 30
@@ -138,14 +137,11 @@ def test_a_commanded_burn_is_flown_over():
     assert np.linalg.norm(error, axis=1).max() < 160.0
 
 
-def test_a_burn_that_nobody_commanded_parts_the_orbit_in_two():
+def test_a_burn_that_nobody_commanded_and_a_clock_that_went_backwards_part_the_orbit_in_two():
     session = Session(5, KICK, kick_at=14)
     known = smooth(session.filtered, QUIET)
     alone = smooth(session.filtered.select(np.arange(STATES) < 15), QUIET)
     assert_allclose(known.state[:15], alone.state, rtol=1e-12)
-
-
-def test_a_clock_that_went_backwards_parts_the_orbit_in_two():
     session = Session(6)
     times = TIMES.copy()
     times[20:] -= 3_600 * 10**9
@@ -268,13 +264,10 @@ def test_a_jump_of_a_hundred_in_chi_square_parts_the_orbit():
         assert bool(np.any(found.state[0] != filtered.state[0])) is smoothed
 
 
-def test_a_selection_keeps_the_degrees_of_its_states():
+def test_a_selection_keeps_its_degrees_and_sigmas_lie_along_the_axes_of_the_orbit():
     some = straight([0.0, 1.0, 2.0]).select(np.array([True, False, True]))
     assert some.innovation_degrees.tolist() == [0, 2]
-
-
-def test_sigmas_lie_along_the_axes_of_the_orbit():
-    """Position along y and velocity along -x: radial is y, transverse -x, normal z."""
+    # Position along y and velocity along -x: radial is y, transverse -x, normal z.
     covariance = np.zeros((1, 9, 9))
     covariance[0, :3, :3] = np.diag([4.0, 9.0, 16.0])
     state = np.array([[0.0, 2e6, 0.0, -1.6e3, 0.0, 0.0, 0.0, 0.0, 0.0]])

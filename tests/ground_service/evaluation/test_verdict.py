@@ -136,7 +136,7 @@ def test_a_requirement_is_met_at_its_limit_not_past_it_and_unknown_without_a_val
     assert judged(None).status == "not judged" and judged(None).value == approx(at_limit)
 
 
-def test_the_declared_estimator_is_judged_and_not_the_best_one():
+def test_the_declared_estimator_is_judged_and_a_pass_for_which_it_is_not_made_named():
     evaluated = found(series("anchored", median=70.0), series("spherical", median=30.0))
     limits = Requirements(estimator="anchored", median_error_m=50.0)
     assert (row("accuracy.median", limits, evaluated).value, verdict_of(requirements(limits, evaluated))[1]) == (
@@ -145,9 +145,6 @@ def test_the_declared_estimator_is_judged_and_not_the_best_one():
     undeclared = row("accuracy.median", replace(limits, estimator=None), evaluated)
     assert (undeclared.value, undeclared.status) == (None, "unknown")
     assert undeclared.note == "the mission description declares no estimator"
-
-
-def test_a_pass_for_which_the_estimator_is_not_made_is_named():
     words = "paper assumes a pass to the north or south, this track runs 50° from the meridian"
     limits = Requirements(estimator="paper", median_error_m=100.0)
     named = row("accuracy.median", limits, found(series("paper", not_applicable=words)))
@@ -212,7 +209,7 @@ def test_an_experiment_is_judged_apart_and_its_accuracy_from_convergence_on():
     assert table["accuracy.median"].value == approx(200.0 * 3**0.5)
 
 
-def test_packets_whose_loss_at_the_edges_is_not_known_are_never_complete():
+def test_packets_of_unknown_loss_are_never_complete_and_one_frame_is_not_judged():
     def judged(*counts):
         return row("completeness.packets", EVERY_LIMIT, found(packets=PacketAccounting(*counts)))
 
@@ -221,9 +218,6 @@ def test_packets_whose_loss_at_the_edges_is_not_known_are_never_complete():
     assert few.status == "not met"
     assert few.note == "60 of 100 packets; without a plan, packets missing at the edges are unknown"
     assert judged(0).value is None
-
-
-def test_two_frames_are_judged_and_one_is_not():
     for count, expected in (
         (2, ("met", "anchored, 2 samples")),
         (1, ("unknown", "only one frame was navigated, too few for a judgement")),
@@ -254,14 +248,11 @@ def test_the_sentence_is_derived_from_the_table_and_names_failures_first(statuse
     assert verdict_of(table(*statuses)) == (sentence, level)
 
 
-def test_many_failures_are_counted_and_the_first_five_named():
+def test_many_failures_are_counted_and_the_budget_takes_the_reference_off_in_squares():
     text, _ = verdict_of(table(*["not met"] * 7))
     assert text.startswith("7 of 7 requirements not met: thing 0") and "; and 2 more." in text
     assert "thing 4" in text and "thing 5" not in text
-
-
-def test_the_error_budget_takes_the_reference_off_in_squares():
-    """A 3-4-12 error is 13 m long; a reference of 3, 4 and 0 m takes 5 m off in squares: 12 m are left."""
+    # A 3-4-12 error is 13 m long; a reference of 3, 4 and 0 m takes 5 m off in squares: 12 m are left.
     error = np.array([[3.0, 4.0, 12.0], [-3.0, 4.0, -12.0], [np.nan, 0.0, 0.0]])
     budget = error_budget(error, (3.0, 4.0, 0.0))
     assert (budget.observed_rms_m, budget.reference_rms_m, budget.estimate_rms_m) == approx((13.0, 5.0, 12.0))
@@ -363,13 +354,10 @@ def test_the_table_of_a_pass_of_which_nothing_is_known():
     assert {one.status for one in requirements(Requirements(), Evaluated())} == {"not judged"}
 
 
-def test_housekeeping_without_a_finite_value_is_unknown():
+def test_values_that_are_not_finite_are_unknown_and_the_first_sample_is_no_reset():
     cold = (HousekeepingParameter("temperature_c", "", np.arange(2), np.full(2, np.nan)),)
     for key in ("resources.temperature_max", "resources.temperature_min"):
         assert (row(key, EVERY_LIMIT, found(housekeeping=cold)).status) == "unknown"
-
-
-def test_the_first_sample_is_no_reset_and_a_series_without_outcomes_has_no_count():
     for triggers, resets in (((), None), (("initialization", "none"), 0.0)):
         started = found(series("anchored", reset_trigger=triggers))
         assert row("resets", EVERY_LIMIT, started).value == resets

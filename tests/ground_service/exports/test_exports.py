@@ -1,7 +1,4 @@
-"""Exports of a pass, read back with the tools that they are made for. Exports over HTTP, with the client, and on
-the command line. Lines and rings at the 180th meridian and around the poles, and the geometry that GDAL makes
-of them.
-"""
+"""Exports over HTTP, client and command line, read back with the tools that they are made for."""
 
 import csv
 import importlib.util
@@ -342,15 +339,12 @@ def test_parquet_has_a_file_for_each_packet_type_with_units(export, rich_pass):
     assert_allclose(times - rich_pass.utc_ns, 400 / 65_536 * 1e9, atol=20_000)
 
 
-def test_tum_trajectories_differ_by_the_error(export):
+def test_trajectories_differ_by_the_error_and_images_are_those_of_the_archive(export):
     files = unzipped(export("tum"))
     solution, reference = (np.loadtxt(io.BytesIO(files[name])) for name in ("spherical.tum", "spherical-reference.tum"))
     assert len(solution) == FRAMES
     distance = np.linalg.norm(solution[:, 1:4] - reference[:, 1:4], axis=1)
     assert_allclose(distance, np.linalg.norm(SPHERICAL_ERROR_RTN_M), atol=1.0)
-
-
-def test_images_are_those_of_the_archive(export):
     files = unzipped(export("images"))
     assert sorted(files) == ["000000.png", "000004.png", "000008.png"]
     assert np.asarray(Image.open(io.BytesIO(files["000004.png"])))[0, 0] == 40
@@ -445,14 +439,11 @@ def linna(rich_ground, tmp_path, capsys):
     return export
 
 
-def test_the_command_writes_one_file(linna, tmp_path):
+def test_the_command_writes_one_file_or_several_into_a_folder_or_a_zip(linna, tmp_path):
     status, text, _ = linna("1 --format oem --json", "pass.oem")
     out = tmp_path / "pass.oem"
     assert (status, json.loads(text)["files"]) == (0, [str(out)])
     assert parse_oem(out.read_text()).segments[0].object_name == "SELENITA"
-
-
-def test_the_command_writes_several_files_into_a_folder_or_a_zip(linna, tmp_path):
     status, text, _ = linna("1 --format csv --json", "tables")
     assert status == linna("1 --format csv", "tables.zip")[0] == 0
     assert len((tmp_path / "tables/frames.csv").read_text().splitlines()) == 1 + FRAMES

@@ -101,7 +101,7 @@ def test_pages_of_this_service_and_programs_may_change_what_they_like(client):
     assert client.post(f"{V1}/telecommands", json=PING, headers=other).status_code == 201
 
 
-def test_only_pages_of_this_service_and_programs_watch_the_feed(client):
+def test_pages_of_another_site_do_not_watch_or_read_but_may_link(client):
     for path in (f"{V1}/live", f"{V1}/payload"):
         for origin in ("https://attacker.example", "null", "http://127.0.0.1:3000"):
             headers = {"Origin": origin, "Host": "127.0.0.1:8042"}
@@ -110,9 +110,6 @@ def test_only_pages_of_this_service_and_programs_watch_the_feed(client):
     for headers in ({}, OWN):
         with client.websocket_connect(f"{V1}/live", headers={"Host": "127.0.0.1:8042", **headers}):
             pass
-
-
-def test_a_page_of_another_site_does_not_read_but_may_link(client):
     cross = {"Sec-Fetch-Site": "cross-site"}
     assert refused(client.get(f"{V1}/passes", headers={**cross, "Sec-Fetch-Mode": "no-cors"}), 403)
     assert client.get("/passes", headers={**cross, "Sec-Fetch-Mode": "navigate"}).status_code == 200

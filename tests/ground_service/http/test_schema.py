@@ -1,5 +1,4 @@
-"""Every operation of the API asked with what its schema allows and with what it does not: no server error, and every
-answer is one that the schema tells of."""
+"""Every operation asked with what its schema allows and does not: no server error, answers as it says."""
 
 import json
 import os

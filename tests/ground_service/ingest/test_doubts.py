@@ -34,12 +34,6 @@ DAY = 24 * HOUR
 YEARS = 70 * 365 * DAY
 
 
-@pytest.fixture(autouse=True)
-def clock():
-    yield
-    set_mission_clock()
-
-
 LAST = TICKS + 11 * (60 << 16)
 
 
@@ -164,15 +158,12 @@ def test_without_a_stated_clock_the_first_packet_may_be_of_a_simulated_flight_an
     assert ground.read(newest_ticks, 1) == TICKS
 
 
-def test_a_clock_of_the_mission_judges_the_first_packet():
+def test_a_clock_of_the_mission_judges_the_first_packet_and_counts_fit_between_their_neighbours():
     for late, doubted in ((-DAY, set()), (0, set()), (DAY, {0}), (100 - TICKS, set())):
         ticks = np.array([TICKS + late])
         assert set(implausible_times(ticks, None, None, TICKS)) == doubted
         assert implausible_times(ticks, ticks, None, TICKS) == {}
         assert implausible_times(np.append(ticks, ticks + HOUR), None, None, TICKS) == {}
-
-
-def test_a_sequence_count_fits_between_its_neighbours():
     for given in ((5, 4, 6), (5, 5, 5), (0, 16_383, 1), (9, None, 1)):
         assert fits_between(*given) is True, given
     assert fits_between(7, 4, 6) is False

@@ -1,7 +1,4 @@
-"""Reading a downlink in windows: no packet lost at a border, the same accounting as read at once. Any split,
-order and repetition of recordings, by any number of processes, gives the same archive. What may happen to a
-running ingest, and archives decoded again.
-"""
+"""A downlink read in windows, in any split, order and repetition, by any number of processes."""
 
 import dataclasses
 import os

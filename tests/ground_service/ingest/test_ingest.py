@@ -1,7 +1,4 @@
-"""Ingest of whole recordings and of pieces: what is stored, counted, refused and made up for after a failure. An
-archive that an older dictionary decoded: never empty, decoded again by itself, whatever happens meanwhile. An
-archive of a version that joined pieces by content: fragments are kept, waiting pieces are listed.
-"""
+"""Ingest of whole recordings and pieces: what is stored, counted, refused, made up for and decoded again."""
 
 import contextlib
 import json

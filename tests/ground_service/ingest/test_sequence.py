@@ -1,6 +1,4 @@
-"""Counting packets: wraps, gaps, restarts, late and stray packets. Decoded columns as the store takes them.
-Ingests are found by the on-board times of their packets.
-"""
+"""Counts of packets: wraps, gaps, restarts, late and stray packets; decoded columns as the store takes them."""
 
 import numpy as np
 import pytest
@@ -31,12 +29,9 @@ def counted(ticks, counts):
     return account.lost, account.restarts, account.conflicts
 
 
-def test_no_packets_are_no_packets():
+def test_no_packets_are_no_packets_and_a_wrap_is_no_gap():
     account = account_sequence(np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64))
     assert (account.lost, account.conflicts, account.restarts, account.gaps) == (0, 0, 0, ())
-
-
-def test_a_wrap_is_no_gap():
     ticks, counts = stream(40_000, first=16_000)
     account = account_sequence(ticks, counts)
     assert account.lost == 0
@@ -58,25 +53,19 @@ def test_what_is_missing_is_found_whatever_the_order_of_arrival(lost, seed, firs
     assert missing == {first + number for number in lost}
 
 
-def test_packets_of_one_instant_on_both_sides_of_a_wrap_are_in_sequence():
+def test_packets_of_one_instant_at_a_wrap_are_in_sequence_and_a_lost_wrap_is_counted_by_the_rate():
     # Yamcs keeps a failing test for this case: same time, wrapped count.
     ticks = np.array([100, 100, 100, 100]) * SECOND
     assert counted(ticks, np.array([16_382, 16_383, 0, 1])) == (0, 0, 0)
-
-
-def test_more_than_a_whole_wrap_lost_in_a_silence_is_counted_by_the_usual_rate():
     ticks, counts = stream(60_000)
     keep = np.r_[0:5000, 55_000:60_000]
     assert account_sequence(ticks[keep], counts[keep]).lost == 50_000
 
 
-def test_a_restart_begins_a_new_run_and_loses_nothing():
+def test_a_restart_begins_a_new_run_and_one_count_used_twice_is_a_conflict():
     before, counts_before = stream(500)
     after, counts_after = stream(300)
     assert counted(np.r_[before, after + before[-1] + 60 * SECOND], np.r_[counts_before, counts_after]) == (0, 1, 0)
-
-
-def test_one_count_used_twice_is_a_conflict():
     ticks, counts = stream(10)
     assert counted(np.r_[ticks, ticks[4] + 1], np.r_[counts, counts[4]]) == (0, 0, 1)
 
@@ -114,12 +103,9 @@ def test_wraps_are_looked_for_where_half_of_one_could_have_been_made(silence_s, 
     assert found[:2] == (lost, restarts)
 
 
-def test_a_fall_within_a_second_is_no_restart_and_one_after_it_is():
+def test_a_fall_after_a_second_is_a_restart_and_counts_go_on_from_the_first_of_each_run():
     for ticks, restarts in ((SECOND, 0), (SECOND + 1, 1)):
         assert counted(np.array([0, ticks]), np.array([10, 9]))[1] == restarts
-
-
-def test_counts_go_on_from_the_first_of_each_run():
     before, counts_before = stream(5, first=16_382)
     after = before[-1] + 60 * SECOND + np.arange(3) * SECOND
     account = account_sequence(np.r_[before, after], np.r_[counts_before, 0, 1, 2])

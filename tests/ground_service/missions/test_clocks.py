@@ -1,5 +1,6 @@
-"""Mission time from the descriptions in force, in every form of the service."""
+"""Mission time: the wall clock, a function, a file, and the descriptions in force."""
 
+import struct
 import time
 from argparse import Namespace
 
@@ -7,7 +8,14 @@ import pytest
 
 from ground_service.access.service import LOCAL_CALLER, session_of
 from ground_service.app import create_app
-from ground_service.clock import follow_missions, independent_now_ns, is_recorded, mission_now_ns, set_mission_clock
+from ground_service.clock import (
+    ClockFile,
+    follow_missions,
+    independent_now_ns,
+    is_recorded,
+    mission_now_ns,
+    set_mission_clock,
+)
 from ground_service.errors import InvalidInput
 from ground_service.missions import clocks
 from ground_service.missions.clocks import mission_clock, read_mission_clock
@@ -44,7 +52,6 @@ def state(ground, clock, number=76):
 def _wall_clock_again():
     yield
     follow_missions(None)
-    set_mission_clock(None)
 
 
 def seconds_after_start():
@@ -139,3 +146,24 @@ def test_a_worker_and_a_scheduler_have_the_clock_of_the_service(ground):
 def test_an_incomplete_clock_is_refused(clock):
     with pytest.raises(InvalidInput, match="mission_clock"):
         parse_mission(TEXT.format(name="m", number=1, clock=clock))
+
+
+def test_mission_time_is_the_wall_clock_until_a_simulation_sets_it():
+    before = time.time_ns()
+    assert before <= mission_now_ns() <= time.time_ns()
+    set_mission_clock(lambda: 1_880_000_000_000_000_000)
+    assert mission_now_ns() == 1_880_000_000_000_000_000
+    set_mission_clock()
+    assert mission_now_ns() >= before
+
+
+def test_a_clock_file_is_read_as_it_is_written(tmp_path):
+    path = tmp_path / "clock"
+    clock = ClockFile(path)
+    before = time.time_ns()
+    assert clock.read() >= before  # there is no file yet
+    path.write_bytes(struct.pack("<q", 5))
+    assert clock.read() == 5
+    with path.open("r+b") as file:
+        file.write(struct.pack("<q", 7))
+    assert clock.read() == 7

@@ -1,6 +1,4 @@
-"""Mission descriptions: refused values, values that are not stated, revisions, and references of passes.
-Automation and receivers of notifications in a mission description, and those of earlier versions.
-"""
+"""Mission descriptions: refused and missing values, revisions, references of passes, automation, receivers."""
 
 import json
 import logging
@@ -74,28 +72,22 @@ def test_a_fault_is_named_with_its_place_what_was_expected_and_what_was_found(li
     assert list(map(str, read_document(text, "m.toml"))) == [str(caught.value)]
 
 
-def test_every_unknown_key_has_a_line_of_its_own():
+def test_every_unknown_key_has_a_line_and_what_is_not_stated_is_none_and_listed():
     faults = read_document('name = "test"\nlinc = 1\n[camera]\nwidht_px = 5\n', "m.toml")
     assert list(map(str, faults)) == [
         "m.toml, camera.widht_px: expected 'width_px', found unknown key 'widht_px'",
         "m.toml, linc: expected 'link', found unknown key 'linc'",
     ]
-
-
-def test_what_is_not_stated_is_none_and_listed():
     mission = parse_mission(TEXT)
     assert mission.camera.width_px is None and mission.frames.gravity_field is None
     assert "camera.width_px" in mission.unknown and "camera.fov_deg" not in mission.unknown
     assert mission.evidence.level is None and mission.evidence.text == ""
 
 
-def test_a_revision_depends_on_what_is_stated_and_not_on_its_layout():
+def test_a_revision_depends_on_what_is_stated_not_on_its_layout_and_a_formatted_mission_is_the_same():
     other = TEXT.replace("[10, 30, 15.5]", "[10.0, 30.0, 15.50] # rounded").replace("\n[", "\n\n[")
     assert parse_mission(other).revision == parse_mission(TEXT).revision
     assert parse_mission(TEXT.replace("15.5", "15.6")).revision != parse_mission(TEXT).revision
-
-
-def test_a_formatted_mission_parses_to_itself():
     mission = parse_mission(TEXT)
     assert parse_mission(format_mission(mission)) == mission
 

@@ -109,7 +109,7 @@ def test_an_answer_older_than_a_change_that_is_known_is_not_kept(archive):
 
 def test_an_answer_that_many_need_at_once_is_made_once(archive):
     begun, go_on = threading.Event(), threading.Event()
-    found: list[int] = []
+    found = []
 
     def slow():
         begun.set()

@@ -56,15 +56,12 @@ def test_frames_that_cannot_be_used_lie_where_their_neighbours_lie():
     assert one.octets == len(FIRST) and two.octets == len(SECOND)
 
 
-def test_octets_between_frames_are_skipped_octets_of_the_frame_before():
+def test_octets_between_frames_belong_to_the_frame_before_and_duplicates_to_their_process():
     octets = FIRST[: 2 * CADU] + bytes(777) + FIRST[2 * CADU :] + SECOND
     one, two = both(octets)
     assert one.octets_skipped == 777 and one.octets == len(FIRST) + 777
     assert two.octets_skipped == 0
     assert found(octets, hours=(10, 11)).octets_skipped == 777
-
-
-def test_a_packet_that_came_twice_is_a_duplicate_of_its_process_in_its_pass():
     again = encode_cadus([event(10 * HOUR, 0), event(10 * HOUR + (5 << 16), 5)], spacecraft_id=SPACECRAFT)
     three = [one.duplicates[EVENTS] for one in (*both(FIRST, again, SECOND), found(FIRST))]
     assert three == [2, 0, 0]
@@ -88,13 +85,10 @@ def test_packets_with_a_wrong_checksum_are_counted_by_process():
     assert (one.crc_errors, one.duplicates, one.frames) == ({EVENTS: 1}, {EVENTS: 0}, None)
 
 
-def test_frames_of_another_spacecraft_are_left_out():
+def test_frames_of_another_spacecraft_and_files_without_a_readable_packet_are_left_out():
     other = encode_cadus([event(10 * HOUR + (k << 16), k) for k in range(60)], spacecraft_id=5)
     one = found(FIRST + other)
     assert (one.frames, one.frames_bad) == (len(FIRST) // CADU, 0)
-
-
-def test_a_file_without_a_readable_packet_belongs_to_no_pass():
     noise = np.random.default_rng(1).integers(0, 256, 5000, dtype=np.uint8).tobytes()
     assert read_raw(noise, SPACECRAFT).span is None
     always = (0, 1 << 20)

@@ -1,7 +1,4 @@
-"""Series from roll-ups: the same as from the samples, in whatever order they came, gaps marked. Filter estimates
-of both packet versions in the archive, and their consistency in the report. Images of a spacecraft:
-downlinked thumbnails and frames of pass archives, on spacecraft time.
-"""
+"""Series from roll-ups, the same as from the samples; estimates of the filter; images of a spacecraft."""
 
 from dataclasses import replace
 
@@ -176,7 +173,7 @@ def test_trends_of_a_spacecraft_need_no_pass(ground, synthetic_pass):
 
 def test_few_texts_of_the_query_for_buckets_find_any_number_of_them(ground, vehicle):
     """Each text is kept by the program and by the server, so their number must not grow with the numbers of buckets."""
-    texts: set[str] = set()
+    texts = set()
     event.listen(ground.database.engine, "before_cursor_execute", lambda *given: texts.add(given[2]))
     with ground.database.reading() as connection:
         rows = connection.execute(

@@ -18,7 +18,6 @@ from tests.ground_service.planning.test_standing import AUTOMATIC, LINKS, MISSIO
 
 UPLOADS = '[uploads]\ntables = ["orientation"]\n'
 CRITICAL = ("perform_function/set_mode", "uplink_first", "uplink_middle", "uplink_last")
-ONE_PERSON = f"one_person_for = {json.dumps(CRITICAL)}\n"
 REQUEST = {"name": "low Sun", "spacecraft_id": 76, "windows": 2, "period_days": 7.0, "horizon_days": 1.0}
 
 

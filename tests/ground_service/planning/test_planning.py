@@ -1,6 +1,4 @@
-"""Candidate windows: every sample of a candidate fulfils the constraints, computed here a second time by hand.
-Windows outside the reference ephemerides: refused where the ground needs the ephemeris.
-"""
+"""Candidate windows: every sample fulfils the constraints, computed here again by hand; preparation of windows."""
 
 import os
 import re
@@ -13,19 +11,21 @@ import pytest
 from ground_service.access.model import AuditFilter
 from ground_service.access.store import list_audit
 from ground_service.contacts.links.core import PredictedContact
-from ground_service.errors import InvalidInput, PlanConflicts
+from ground_service.errors import Conflict, InvalidInput, PlanConflicts
 from ground_service.ground import run_apart
 from ground_service.missions.ephemerides.service import add_ephemeris, covering_ephemerides, withdraw_ephemeris
+from ground_service.missions.model import Uploads
 from ground_service.missions.service import add_mission
 from ground_service.planning.core import Constraints, Planner, Resources, data_octets, frames_between, storage_peak
 from ground_service.planning.filling import Option
+from ground_service.planning.preparation import experiment_accuracy, experiment_state, prepare_window
 from ground_service.planning.service import WindowEntry, add_window
 from ground_service.planning.store import get_record
 from ground_service.planning.window_states import PlannedSpan, WindowEvidence, span_conflicts, state_of
 from lunar.camera import PinholeCamera
 from lunar.catalogue import load_catalogue
 from lunar.constants import GM_MOON_M3_S2, MOON_RADIUS_M
-from lunar.ephemeris import Ephemeris, ephemeris_from_states
+from lunar.ephemeris import Ephemeris, EphemerisSegment, ephemeris_from_states
 from lunar.frames import IauOrientation
 from lunar.messages.ephemeris_files import load_ephemeris
 from lunar.messages.oem import save_oem
@@ -33,6 +33,8 @@ from lunar.third_bodies import sun_position_icrf_m
 from lunar.timescales import parse_utc, tdb_s_from_utc_ns
 from tests.ground_service.conftest import add_reference, save_circle
 from tmtc.dictionary.payload import DICTIONARY
+from tmtc.dictionary.tables import unpack_anchor_table, unpack_initial_state, unpack_orientation_table
+from tmtc.packets.large_data import LargeDataReceiver
 
 NS = 1_000_000_000
 START = parse_utc("2029-08-07T06:00:00Z")
@@ -169,7 +171,7 @@ def test_the_battery_falls_with_the_load():
     )
 
 
-def test_data_leave_the_store_in_the_order_they_came():
+def test_data_are_as_long_as_their_packets_and_leave_the_store_in_the_order_they_came():
     first, second = Option(0, 100 * NS, 1000), Option(200 * NS, 300 * NS, 500)
     contacts = [
         PredictedContact(one, a * NS, b * NS) for one, a, b in zip("aba", (400, 450, 900), (460, 500, 960), strict=True)
@@ -179,9 +181,6 @@ def test_data_leave_the_store_in_the_order_they_came():
     early = [PredictedContact("a", 100 * NS, 200 * NS)]
     assert storage_peak([first, second], early, 80.0, second) == (1000, None)
     assert storage_peak([first], contacts, 0.0, first) == (1000, None)
-
-
-def test_data_of_a_frame_are_as_long_as_its_packets():
     # Packet lengths by the ICD: detections 35 + 9 n, navigation state 84, frame outcome 59, housekeeping 92 octets.
     names = ("detections", "navigation_state", "frame_outcome", "housekeeping")
     detections, state, outcome, housekeeping = (DICTIONARY.packet(name).base_length for name in names)
@@ -297,3 +296,104 @@ def test_an_ephemeris_belongs_to_a_spacecraft_and_can_be_withdrawn(ground, synth
 
 def test_a_function_runs_apart_from_this_process():
     assert run_apart(os.getpid) != os.getpid()
+
+
+BEGIN = parse_utc("2029-08-08T10:00:00Z")
+STOP = BEGIN + 600 * NS
+ALL = Uploads(
+    tables=("orientation", "anchor_ephemeris", "initial_state"), sigma_position_m=500.0, sigma_velocity_m_s=0.5
+)
+
+
+def ticks_of(utc_ns):
+    """Return the reading of a clock that is 7 s ahead, counted from the start of the window."""
+    return 1_000_000 + (utc_ns - BEGIN + 7 * NS) * 65_536 // NS
+
+
+@pytest.fixture(scope="module")
+def reference():
+    times = np.arange(BEGIN - 3_600 * NS, STOP + 3_600 * NS, 30 * NS)
+    angle = 2.0 * np.pi * (times - BEGIN) / (6_672.0 * NS)
+    rate = 2.0 * np.pi / 6_672.0
+    zero = np.zeros_like(angle)
+    position = 1.768e6 * np.stack([np.cos(angle), zero, np.sin(angle)], axis=1)
+    velocity = 1.768e6 * rate * np.stack([-np.sin(angle), zero, np.cos(angle)], axis=1)
+    segment = EphemerisSegment(times, position, velocity, object_name="A", object_id="A", degree=7)
+    return Ephemeris((segment,))
+
+
+def prepared(ephemeris, uploads=ALL, *start, late=0):
+    return prepare_window(uploads, ephemeris, IauOrientation(), BEGIN + late, STOP + late, ticks_of, 8, *start)
+
+
+def loaded(activities):
+    """Octets by number of the table, as the payload puts the parts together."""
+    receiver, found = LargeDataReceiver(), {}
+    numbers = {"anchor_ephemeris": 1, "orientation": 8, "initial_state": 9}
+    for _, name, arguments in activities:
+        if name.startswith("uplink"):
+            octets = np.array([one["octet"] for one in arguments["items"]], dtype=np.uint8)
+            values = {**arguments, "table": numbers[arguments["table"]], "items": {"octet": octets}}
+            whole = receiver.accept(name, values)
+            found[whole.table] = whole.octets
+    return found
+
+
+def test_the_tables_hold_the_reference_at_on_board_times(reference):
+    activities, state = prepared(reference)
+    tables = loaded(activities)
+    initial = unpack_initial_state(tables[9])
+    assert initial.ticks == ticks_of(BEGIN)
+    np.testing.assert_allclose(initial.position_icrf_m, [1.768e6, 0.0, 0.0], atol=1e-3)
+    np.testing.assert_allclose(initial.velocity_icrf_m_s, [0.0, 0.0, 1664.97], atol=0.01)
+    assert (initial.sigma_position_m, initial.sigma_velocity_m_s) == (500.0, 0.5)
+    assert state.utc_ns == BEGIN
+    anchor = unpack_anchor_table(tables[1])
+    assert anchor.ticks[0] == ticks_of(BEGIN - 120 * NS) and anchor.ticks[-1] >= ticks_of(STOP + 100 * NS)
+    k = int(np.flatnonzero(anchor.ticks == ticks_of(BEGIN))[0])
+    expected = IauOrientation().mcmf_from_icrf(float(tdb_s_from_utc_ns(BEGIN))) @ [1.768e6, 0.0, 0.0]
+    np.testing.assert_allclose(anchor.position_mcmf_m[k], expected, atol=0.01)
+    orientation = unpack_orientation_table(tables[8])
+    assert orientation.ticks[0] < ticks_of(BEGIN) < ticks_of(STOP) < orientation.ticks[-1]
+
+
+def test_a_window_of_the_experiment_starts_from_the_stated_error_with_its_declared_accuracy(reference):
+    made = [experiment_state(reference, 1_000.0, BEGIN + k * NS, 76) for k in range(400)]
+    known = [reference.at(np.array([one.utc_ns])) for one in made]
+    position = np.array([a.position_icrf_m - b[0][0] for a, b in zip(made, known, strict=True)])
+    velocity = np.array([a.velocity_icrf_m_s - b[1][0] for a, b in zip(made, known, strict=True)])
+    # 400 draws: the standard deviation of each axis is known to 3.5 %, its mean to 5 %.
+    np.testing.assert_allclose(position.std(axis=0), 1_000.0, rtol=0.12)
+    np.testing.assert_allclose(position.mean(axis=0), 0.0, atol=180.0)
+    np.testing.assert_allclose(velocity.std(axis=0), 1_000.0 * 2.0 * np.pi / 6_672.0, rtol=0.12)
+    again = experiment_state(reference, 1_000.0, BEGIN, 76)
+    np.testing.assert_array_equal(again.position_icrf_m, made[0].position_icrf_m)
+    assert (experiment_state(reference, 1e3, BEGIN, 77).position_icrf_m != again.position_icrf_m).all()
+    stated = experiment_accuracy(ALL, 1_000.0, again)
+    activities, state = prepared(reference, stated, again)
+    initial = unpack_initial_state(loaded(activities)[9])
+    assert state is again and initial.sigma_position_m == 1_000.0
+    assert initial.sigma_velocity_m_s == pytest.approx(0.9417, rel=5e-3)
+    np.testing.assert_allclose(initial.position_icrf_m, again.position_icrf_m, atol=1e-3)
+
+
+def test_standby_comes_first_then_the_tables_with_the_start_state_last_and_the_downlink_after_the_window(reference):
+    activities, _ = prepared(reference)
+    times = [utc_ns for utc_ns, _, _ in activities]
+    assert times == sorted(times)
+    modes = [(utc_ns, one["argument_1"]) for utc_ns, name, one in activities if name == "perform_function"]
+    assert modes == [(BEGIN - 60 * NS, 1.0), (STOP + 20 * NS, 3.0)]
+    loads = [(utc_ns, one["table"]) for utc_ns, name, one in activities if name.startswith("uplink")]
+    assert loads[-1][1] == "initial_state"
+    assert all(BEGIN - 60 * NS < utc_ns < BEGIN for utc_ns, _ in loads)
+
+
+def test_without_tables_only_the_mode_changes():
+    activities, state = prepared(None, Uploads())
+    assert [name for _, name, _ in activities] == ["perform_function"] * 2 and state is None
+
+
+def test_a_window_without_a_reference_that_covers_it_is_refused(reference):
+    for ephemeris, late in ((None, 0), (reference, 7_800 * NS)):
+        with pytest.raises(Conflict, match="its tables need a reference ephemeris"):
+            prepared(ephemeris, late=late)

@@ -1,7 +1,4 @@
-"""Builds as programs inside limits: what becomes of those that behave and of those that do not. Parameters of
-builds on the flight code are checked in the sandbox before registration. Verdicts in lists: names of builds,
-and why the verdict is not pass.
-"""
+"""Builds as programs inside limits: what becomes of those that behave and do not; their verdicts in lists."""
 
 import dataclasses
 import subprocess
@@ -374,14 +371,11 @@ def regression(verdict, gates, **values):
     return Regression(id="1", verdict=verdict, created=UtcTime(0), result=result)
 
 
-def test_a_list_names_builds_and_not_only_their_hashes():
+def test_a_list_names_builds_and_a_gate_that_was_waived_does_not_count():
     summary = regression("pass", [gate("recall", "pass")]).summary()
     assert summary.candidate_title == "new 1.2 (abababababab)"
     assert summary.baseline_title == "old 1.2 (abababababab)"
     assert (summary.reasons, summary.headline) == ([], "pass: no loss")
-
-
-def test_a_gate_that_was_waived_in_an_earlier_verdict_does_not_count():
     found = regression("pass", [gate("other", "fail", waived="known"), gate("recall", "pass", waived=None)])
     assert found.result.gates[0].text == "other: waived: known"
     assert found.summary().gates_failed == 0

@@ -1,8 +1,9 @@
 """Builds, archives and regressions over HTTP."""
 
 import json
-import zipfile
 from functools import partial
+from pathlib import Path
+from shutil import make_archive
 
 import pytest
 
@@ -21,11 +22,8 @@ def is_done(client, job_id):
     return found(client, f"jobs/{job_id}")["state"] == "done"
 
 
-def zipped(folder, target):
-    with zipfile.ZipFile(target, "w") as packed:
-        for path in sorted(folder.iterdir()):
-            packed.write(path, path.name)
-    return target.read_bytes()
+def zipped(build):
+    return Path(make_archive(str(build.parent), "zip", build.parent)).read_bytes()
 
 
 def test_a_build_is_registered_held_against_another_and_judged(client, make_flyable, make_build, tmp_path):
@@ -37,7 +35,7 @@ def test_a_build_is_registered_held_against_another_and_judged(client, make_flya
     digests = []
     for name, options in (("good", {}), ("broken", {"program": "raise SystemExit(4)"})):
         file = make_build(name, {"synthetic pass 51": flown.packets}, **options)
-        answer = client.post(f"{V1}/builds", content=zipped(file.parent, tmp_path / f"{name}.zip"))
+        answer = client.post(f"{V1}/builds", content=zipped(file))
         assert answer.status_code == 201, answer.text
         assert (answer.json()["name"], answer.json()["kind"]) == (name, "command")
         digests.append(answer.json()["digest"])
@@ -92,9 +90,9 @@ def test_something_else_than_a_zip_is_no_build(client):
     assert "expected a complete zip file, found something else, or a part of one" in refused.text
 
 
-def test_only_an_administrator_registers_a_program(guarded, make_build, tmp_path):
+def test_only_an_administrator_registers_a_program(guarded, make_build):
     client, heads = guarded
-    body = zipped(make_build("program").parent, tmp_path / "b.zip")
+    body = zipped(make_build("program"))
     found = {role: client.post(f"{V1}/builds", content=body, headers=one).status_code for role, one in heads.items()}
     assert found == {"viewer": 403, "operator": 403, "admin": 201}
 

@@ -1,7 +1,4 @@
-"""Gates on simulated passes of known recall, false detections, fixes and errors: what they claim, and what not.
-Samples of the gates: figures of one estimator by frame, units of the evidence. Paired statistics over units
-and Holm's procedure: against printed examples and simulation.
-"""
+"""Gates and paired statistics on simulated passes of known figures: what they claim, and what not."""
 
 from dataclasses import replace
 
@@ -65,7 +62,6 @@ NARROW = read_policy(
     "narrow",
 ).policy
 FRAMES = 49
-Passes = dict[str, PassFrames]
 
 
 def simulated(
@@ -168,13 +164,10 @@ def test_a_degraded_build_fails_by_the_metric_that_is_worse(passes, faults, name
         assert failed(suite(0, passes), suite(noise, passes, **faults)) == {name}
 
 
-def test_a_better_build_passes_on_one_window_and_the_bounds_say_that_it_is_better():
+def test_a_better_build_passes_on_one_window_and_a_loss_in_one_terrain_or_pass_fails_there():
     gates = judge(suite(0, 1), suite(1, 1, recall=0.8), POLICY)
     assert verdict_of(gates) == "pass"
     assert by_name(gates)["detector.recall"].change_high < 0.0
-
-
-def test_a_loss_in_one_kind_of_terrain_or_on_one_pass_alone_fails_there():
     gates = judge(suite(0), suite(1, recall=0.72, other_kind_recall=0.58), POLICY)
     assert "sparse terrain" in places(gates)
     assert "cratered terrain" not in {gate.pass_id for gate in gates}
@@ -182,16 +175,13 @@ def test_a_loss_in_one_kind_of_terrain_or_on_one_pass_alone_fails_there():
     assert "pass 3" in found and not found & {"pass 0", "pass 1", "pass 2", "pass 4"}
 
 
-def test_identical_octets_pass_at_once_whatever_the_number_of_frames():
+def test_identical_octets_pass_at_once_and_few_tracks_say_how_many_frames_are_needed():
     few = suite(0, 1, frames=6, tracks=4)
     assert verdict_of(judge(few, few, POLICY)) == "pass"
     assert judged(few, few).reason == "identical in every octet"
     # The same values with another octet somewhere are compared by chance: four tracks claim nothing.
     assert judged(few, changed(few, digests=(b"other",))).outcome == "inconclusive"
     assert judged(few, changed(few, undecodable=1)).reason.startswith("4 of 90")
-
-
-def test_few_tracks_claim_only_a_loss_beyond_the_margin_and_say_how_many_frames_are_needed():
     before, after, slight, great = (
         suite(noise, 1, tracks=30, recall=recall) for noise, recall in ((0, 0.7), (1, 0.7), (1, 0.6), (1, 0.2))
     )
@@ -233,15 +223,12 @@ def test_the_test_of_recall_is_mcnemars_over_tracks():
     assert (recall.outcome, recall.evidence, recall.frames) == ("fail", "120 tracks", 300)
 
 
-def test_a_failure_needs_a_lower_bound_above_what_is_material():
+def test_a_failure_needs_a_lower_bound_above_what_is_material_and_unseen_pairs_have_their_error():
     """Every thousandth row lost: certain, and not material."""
     whole = [1] * 50
     recall = judged(*rows([whole] * 4, [[0, *whole[1:]], *[whole] * 3]))
     assert recall.baseline - recall.candidate == approx(0.005)
     assert recall.p_value < 1e-6 and recall.outcome == "pass"
-
-
-def test_without_a_changed_track_the_error_is_that_of_unseen_pairs():
     recall = judged(*rows([[1, 0]], [[1, 0]], copies=100))
     assert recall.change_high == approx(stats.t(99).ppf(0.95) * 1.8 / 200)
     assert recall.outcome == "pass"
@@ -345,16 +332,13 @@ def test_processor_times_are_compared_by_the_median_of_their_ratios_from_five_pa
     assert judged(suite(0, **TIMES), busy, "latency.total").outcome == "pass"
 
 
-def test_a_program_without_times_of_its_frames_is_judged_by_the_processor_time_of_its_run():
+def test_a_program_without_times_is_judged_by_its_run_and_a_share_of_the_baseline_is_a_percentage():
     """Four times the processor time fails although all packets are the same; half a second more is tolerated."""
     before = suite(0, 2, cpu_s=5.0)
     for cpu_s, outcome in ((20.0, "fail"), (5.4, "pass"), (float("nan"), "not judged")):
         gates = by_name(judge(before, suite(0, 2, cpu_s=cpu_s), POLICY))
         assert (gates["latency.run"].outcome, gates["latency.total"].outcome) == (outcome, "not judged")
     assert judged(suite(0, 2, cpu_s=0.1), suite(0, 2, cpu_s=0.4), "latency.run").passed
-
-
-def test_a_loss_that_is_a_share_of_the_baseline_is_a_percentage():
     gates = by_name(judge(suite(0, 12), suite(1, 12), POLICY))
     assert (gates["navigation.anchored.p50"].relative, gates["detector.recall"].relative) == (True, False)
     assert [loss_text(one, True) for one in (0.005, 0.15, 70.7)] == ["0.5 %", "15 %", "7,070 %"]
@@ -392,16 +376,13 @@ def test_exact_gates_and_the_verdict_of_a_placebo_are_rejected_if_they_fail():
     assert doubted == {"telemetry.undecodable", "verdict"}
 
 
-def test_a_position_without_a_reference_is_a_value():
+def test_a_position_without_a_reference_is_a_value_and_its_wrong_fixes_are_not_judged():
     before, silence = suite(0, 1), "telemetry.frames_without_value"
     anchored = replace(before["pass 0"].estimators["anchored"], error_m=np.full(FRAMES, np.nan))
     unknown = changed(before, estimators={"anchored": anchored})
     assert silence not in failed(before, unknown)
     silent = replace(anchored, stated=np.arange(FRAMES) > 3)
     assert silence in failed(unknown, changed(before, estimators={"anchored": silent}))
-
-
-def test_wrong_fixes_are_not_judged_without_a_reference():
     before = suite(1, passes=1)
     unknown = _estimator(np.ones(FRAMES, np.bool_), np.full((FRAMES, 3), np.nan), np.ones((FRAMES, 3)), {0: "fixed"})
     after = changed(before, estimators={"anchored": unknown})
@@ -423,15 +404,12 @@ def test_exact_gates_tolerate_what_the_policy_says():
         assert failed(wrong(five, 9), wrong(rest, count)) == names
 
 
-def test_passes_without_images_judge_fixes_and_telemetry_only():
+def test_passes_without_images_judge_fixes_and_telemetry_and_no_metric_that_builds_lack():
     gates = by_name(judge(suite(0, 2), suite(1, 2, recall=0.2, fixes=0.5), POLICY, imaged=()))
     assert gates["detector.recall"].reason == "no pass was replayed from images"
     assert gates["detector.recall"].outcome == gates["memory"].outcome == "not judged"
     assert gates["navigation.anchored.fixes"].outcome == "fail"
     assert "latency.network" not in gates and "detector.bias" not in gates
-
-
-def test_a_metric_that_neither_build_has_is_not_judged():
     before, after = (changed(suite(noise, 1), estimators={}) for noise in (0, 1))
     gates = judge(before, after, POLICY)
     assert by_name(gates)["navigation.anchored.fixes"].reason == "neither build has this metric"
@@ -481,14 +459,11 @@ def test_the_verdict_is_that_of_the_worst_deciding_gate(outcomes, verdict):
     assert verdict_of(gates) == verdict
 
 
-def test_only_passes_of_both_builds_are_compared():
+def test_only_passes_of_both_builds_are_compared_and_what_the_baseline_lacks_is_open():
     assert judge({}, {}, POLICY) == []
     before, after = suite(0, 2), suite(1, 2)
     del after["pass 0"]
     assert judged(before, after).frames == FRAMES
-
-
-def test_a_value_that_the_baseline_lacks_leaves_its_gate_open():
     fixes = judged(changed(suite(0, 1), estimators={}), suite(1, 1), "navigation.anchored.fixes")
     assert (fixes.outcome, fixes.reason) == ("inconclusive", "unknown: the baseline has no value")
 
@@ -514,17 +489,14 @@ def test_squared_normalised_errors_are_summed_over_the_axes_and_unknown_without_
     assert not hasattr(frames, "nees")
 
 
-def test_a_track_is_one_crater_in_one_visit():
+def test_a_track_is_one_crater_in_one_visit_and_a_cell_is_where_its_sight_meets_the_sphere():
     crater = np.array([7, 3, 7, 7, 3, 7])
     frame = np.array([0, 0, 1, 2 + VISIT_GAP_FRAMES, 1, 1 + VISIT_GAP_FRAMES])
     # Crater 7 is out of view for as long as a visit may have gaps, and is then seen twice: still one track.
     assert _tracks(crater, frame).tolist() == [1, 0, 1, 1, 0, 1]
     frame[[3, 5]] += 1
     assert _tracks(crater, frame).tolist() == [1, 0, 1, 2, 0, 2]
-
-
-def test_a_ground_cell_is_where_the_line_of_sight_meets_the_sphere():
-    """From 100 km above 10.1 N 20 E: nadir, 3 degrees off nadir (5.2 km, below a cell), and above the horizon."""
+    # From 100 km above 10.1 N 20 E: nadir, 3 degrees off nadir (5.2 km, below a cell), and above the horizon.
     up = mcmf_from_spherical(np.radians(10.1), np.radians(20.0))
     up = up / np.linalg.norm(up)
     east = np.cross([0.0, 0.0, 1.0], up) / np.linalg.norm(np.cross([0.0, 0.0, 1.0], up))
@@ -535,7 +507,7 @@ def test_a_ground_cell_is_where_the_line_of_sight_meets_the_sphere():
     assert cells.tolist() == [40 * 100_000 + 78, 40 * 100_000 + 79, -1]
 
 
-def test_terrain_is_cratered_by_the_density_of_catalogued_craters():
+def test_terrain_is_cratered_by_its_density_and_holm_steps_down_as_in_the_textbook():
     """Forty craters of 6 km around 0 N 0 E, 32 within 100 km are the limit; one alone at 0 N 90 E."""
     around = np.linspace(-1.0, 1.0, 40)
     longitude = np.radians(np.append(around, 90.0))
@@ -543,10 +515,7 @@ def test_terrain_is_cratered_by_the_density_of_catalogued_craters():
     expected = ExpectedCraters(*(np.array([5, 40]) for _ in range(7)))
     kinds = terrain_kinds(catalogue, expected, np.array([0, 1]))
     assert [KINDS[kind] for kind in kinds] == ["cratered", "sparse"]
-
-
-def test_holm_steps_down_as_in_the_textbook_example():
-    """Four p-values at 0.05: 0.005 and 0.01 are refused (0.0125, 0.0167), 0.03 is kept at 0.025, all after it too."""
+    # Four p-values at 0.05: 0.005 and 0.01 are refused (0.0125, 0.0167), 0.03 is kept at 0.025, all after it too.
     p_values = [0.01, 0.04, 0.03, 0.005]
     levels = holm_levels(p_values, 0.05)
     assert [p <= level for p, level in zip(p_values, levels, strict=True)] == [True, False, False, True]
@@ -570,15 +539,12 @@ def test_rows_are_summed_by_unit_and_units_of_either_build_are_aligned():
     assert np.isnan(sums([], [], []).value)
 
 
-def test_the_error_of_a_ratio_of_equal_units_is_that_of_a_mean():
+def test_the_error_of_a_ratio_is_that_of_a_mean_without_differences_between_kinds_of_terrain():
     values = np.random.default_rng(1).standard_normal(400)
     one = UnitSums(np.arange(400), np.zeros(400, np.int64), values, np.ones(400))
     assert ratio_error(one) == approx(np.std(values, ddof=1) / 20.0)
     assert np.isnan(ratio_error(sums([1], [1], [1])))
-
-
-def test_a_difference_between_kinds_of_terrain_is_no_chance():
-    """All units of one kind change by 1, all of the other by 0: within each kind nothing varies."""
+    # All units of one kind change by 1, all of the other by 0: within each kind nothing varies.
     kind = np.repeat([0, 1], 50)
     before = UnitSums(np.arange(100), kind, np.zeros(100), np.ones(100))
     after = UnitSums(np.arange(100), kind, kind.astype(float), np.ones(100))
@@ -602,7 +568,7 @@ def test_a_one_sided_test_is_wrong_as_often_as_it_says(correlated):
     assert 0 < wrong <= stats.binom.isf(1e-4, 400, 0.05)
 
 
-def test_the_mean_change_of_passes_is_a_ratio_for_lengths_and_a_difference_for_shares():
+def test_the_change_of_passes_is_a_ratio_or_a_difference_and_frames_follow_the_square_of_its_error():
     before, after = np.array([1.0, 2.0, 4.0, np.nan]), np.array([2.0, 4.0, 8.0, 1.0])
     assert mean_change(before, after, relative=True).estimate == approx(np.log(2.0))
     change = mean_change(before, after, relative=False)
@@ -610,9 +576,6 @@ def test_the_mean_change_of_passes_is_a_ratio_for_lengths_and_a_difference_for_s
     assert change.error == approx(np.std([1.0, 2.0, 4.0], ddof=1) / np.sqrt(3.0))
     assert (change.baseline, change.candidate) == (2.0, 3.0)
     assert mean_change(before[3:], after[3:], relative=True).units == 0
-
-
-def test_the_frames_needed_follow_the_square_of_error_over_distance():
     assert frames_needed(100, 0.05, 0.01, 1.0) == 2500
     assert frames_needed(100, 0.05, 0.0, 1.0) is None
     assert frames_needed(10, 1.0, 1e-6, 1.0) is None

@@ -25,7 +25,7 @@ from ground_service.regression.archives import (
     pack_archive,
     pin_archive,
 )
-from ground_service.regression.builds import Build, load_build, register_build, registered_build
+from ground_service.regression.builds import load_build, register_build, registered_build
 from ground_service.regression.documents import (
     regression_html,
     regression_junit,
@@ -317,7 +317,7 @@ def test_a_replay_is_done_once_and_one_that_failed_again(home, judge, first, mak
     outcome = judge()
     digest = keep_archive(home, first).digest
     before = find_replay(home, digest, outcome.candidate)
-    flown: list[int] = []
+    flown = []
 
     def run(candidate):
         def progress(items, total):
@@ -505,7 +505,7 @@ def test_the_settings_say_how_long_archives_are_kept(tmp_path, monkeypatch):
 
 
 def test_a_registered_build_is_found_by_the_beginning_of_its_identity(ground, make_build, packets):
-    build: Build = register_build(ground, load_build(make_build("kept", packets)))
+    build = register_build(ground, load_build(make_build("kept", packets)))
     assert registered_build(ground, build.digest[:12]).digest == build.digest
     (build.folder / "fly.py").write_text("changed behind its back")
     with pytest.raises(InvalidInput, match="it was registered with"):

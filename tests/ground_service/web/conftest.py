@@ -86,8 +86,8 @@ class Console:
     def __init__(self):
         self._listener = socket.create_server(("127.0.0.1", 0))
         self.port = self._listener.getsockname()[1]
-        self.received: list[str] = []
-        self._clients: list[socket.socket] = []
+        self.received = []
+        self._clients = []
         self._thread = threading.Thread(target=self._accept, daemon=True)
         self._thread.start()
 
@@ -272,7 +272,7 @@ def strict_page(browser, url, *, strict=True):
     context = patient(browser.new_context(base_url=url, viewport={"width": 1280, "height": 900}))
     opened = context.new_page()
     opened.add_init_script(NOTE_VIOLATIONS if strict else COUNT_REQUESTS)
-    errors: list[str] = []
+    errors = []
     opened.on("pageerror", lambda error: errors.append(str(error)))
     opened.on("request", lambda request: _note_foreign(request.url, url, errors))
     if strict:

@@ -25,8 +25,7 @@ LIVE = "/api/v1/live?values=true"
 @pytest.fixture
 def server_url(migrated_postgres):
     """An empty PostgreSQL database with the schema."""
-    url = migrated_postgres()
-    return url
+    return migrated_postgres()
 
 
 def ask(port, path, body=None):

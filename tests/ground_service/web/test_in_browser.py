@@ -2,7 +2,7 @@
 
 import re
 import time
-import zipfile
+from shutil import make_archive
 
 from ground_service.regression.archives import pack_archive
 from tests.ground_service.regression.test_regressions import with_detections
@@ -589,13 +589,6 @@ def test_a_series_of_a_chart_is_hidden_with_its_band_and_shown_again_with_keys(p
     expect(label).to_have_attribute("aria-pressed", "false")
 
 
-def zipped(folder, target):
-    with zipfile.ZipFile(target, "w") as packed:
-        for path in sorted(folder.iterdir()):
-            packed.write(path, path.name)
-    return target
-
-
 def test_a_build_is_brought_run_and_judged(page, make_flyable, make_build, tmp_path):
     flown = make_flyable(frames=12, seed=61)
     pack_archive(flown.folder, tmp_path / "pass.zip")
@@ -605,7 +598,7 @@ def test_a_build_is_brought_run_and_judged(page, make_flyable, make_build, tmp_p
     broken = {"program": "raise SystemExit(4)"}
     for name, packets, options in (("good", found, {}), ("half", half, {}), ("broken", found, broken)):
         build = make_build(name, packets, **options)
-        files.append(("builds", zipped(build.parent, tmp_path / f"{name}.zip")))
+        files.append(("builds", make_archive(str(tmp_path / name), "zip", build.parent)))
     settled(page, "/regression")
     for kind, file in files:
         page.locator("#zip-kind").select_option(kind)

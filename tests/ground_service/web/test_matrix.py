@@ -7,7 +7,6 @@ import itertools
 import os
 import subprocess
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 import pytest
@@ -28,16 +27,16 @@ from lunar.timescales import format_utc
 from tests.ground_service.conftest import SPACECRAFT, START, cells, enter_files
 from tests.ground_service.web.conftest import COUNT_REQUESTS, patient
 from tests.ground_service.web.test_in_browser import answered, settled
-from tests.ground_service.web.test_shift import MISSION, PASS_MISSION, Spacecraft
+from tests.ground_service.web.test_shift import MISSION, Spacecraft
 from tests.lazy import Lazy, expect
+from tests.scenarios import GOLDEN
 from tests.serving import wait_for
 
-Looks = tuple[tuple[Literal["light", "dark"], str, int], ...]
 FONTS = {"DejaVu": "DejaVu Sans", "Arial": "Liberation Sans"}
 """Fonts by the name in the table; Liberation Sans has the widths of Arial."""
 
-EVERY_LOOK: Looks = tuple(itertools.product(("light", "dark"), FONTS, (1280, 768, 390)))
-FEW_LOOKS: Looks = (
+EVERY_LOOK = tuple(itertools.product(("light", "dark"), FONTS, (1280, 768, 390)))
+FEW_LOOKS = (
     ("light", "Arial", 1280), ("dark", "Arial", 768), ("light", "DejaVu", 390), ("dark", "Arial", 390),
 )  # fmt: skip
 """Each scheme, font and width at least once; the last width is that of the keyboard."""
@@ -119,7 +118,7 @@ def worked(tmp_path_factory, make_pass, make_flyable, make_build, console, serve
     folder = tmp_path_factory.mktemp("worked")
     home = folder / "home"
     spacecraft = Spacecraft()
-    received = make_pass(mission=PASS_MISSION)
+    received = make_pass(mission=GOLDEN)
     learned = make_pass(frames=24, seed=4)
     catalogue = load_catalogue(learned.folder / "catalogue.csv")
     save_catalogue(catalogue.select(np.arange(len(catalogue)) % 3 > 0), learned.folder / "catalogue.csv")

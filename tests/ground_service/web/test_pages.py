@@ -56,14 +56,11 @@ def test_no_other_file_can_be_reached(service, path):
     assert ask(service.url + path)[0] == 404
 
 
-def test_every_library_that_is_served_comes_with_its_licence(service):
+def test_every_library_comes_with_its_licence_and_the_map_needs_the_albedo_product(service):
     _, body, _ = ask(service.url + "/licences")
     assert b"Permission is hereby granted" in body  # uPlot, MIT
     assert b"Redistribution and use in source and binary forms" in body  # Leaflet, BSD-2-Clause
     assert b"Apache License" in body  # Swagger UI
-
-
-def test_the_map_needs_the_albedo_product(service):
     assert ask(service.url + "/moon.jpg")[0] == 404
 
 

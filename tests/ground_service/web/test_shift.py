@@ -22,7 +22,7 @@ from lunar.timescales import ticks_from_utc_ns
 from tests.ground_service.conftest import circular_states
 from tests.ground_service.web.conftest import TIMEOUT_S, end_socket, press, shows, strict_page
 from tests.lazy import expect
-from tests.scenarios import SELENITA
+from tests.scenarios import GOLDEN, SELENITA
 from tests.serving import wait_for
 from tmtc.dictionary.payload import DICTIONARY
 from tmtc.downlink import DownlinkEncoder
@@ -69,32 +69,6 @@ send = "manual"
 uplink = "127.0.0.1:{up}"
 """
 )
-
-PASS_MISSION = """name = "archive"
-[spacecraft]
-id = 76
-[frames]
-orientation = "IAU WGCCRE 2009"
-gravity_field = "GRGM1200L (12x12, built in)"
-[camera]
-pointing = "nadir"
-width_px = 512
-height_px = 512
-fov_deg = 120.0
-k1 = 0.0
-[reference]
-sigma_rtn_m = [3.0, 4.0, 0.0]
-[requirements]
-estimator = "spherical"
-median_error_m = 200.0
-p95_error_m = 300.0
-better_than = ["propagate-only"]
-packets_percent = 99.9
-frames_percent = 99.0
-recall = 0.7
-precision = 0.5
-temperature_max_c = 60.0
-"""
 
 
 @dataclass
@@ -187,7 +161,7 @@ def shift(tmp_path, make_pass, console, serve):
     with open_ground(home) as ground:
         add_user(ground, "root", "admin")
         token = add_user(ground, "ann", "operator")
-        import_archive(ground, make_pass(mission=PASS_MISSION).folder)
+        import_archive(ground, make_pass(mission=GOLDEN).folder)
         add_mission(ground, MISSION.format(**ports).encode(), actor="root")
         stored = ground.files.put_file(tmp_path / "coming.oem")
         add_ephemeris(ground, stored, name="coming.oem", precedence=0, actor="root")

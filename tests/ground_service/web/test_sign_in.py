@@ -1,7 +1,4 @@
-"""Pages of a service that has users. Sign-in with an OpenID provider in the browser. The provider has another
-host name: it is another site. The API page in Chromium: operations are shown and called under the content
-security policy. Pages of administrators: users with their tokens, and the status of the service.
-"""
+"""Pages of a service that has users: sign-in by token and provider, users, status, and the page of the API."""
 
 import re
 

@@ -1,8 +1,10 @@
-"""CCSDS AEM and OEM in XML; and ephemerides of Horizons and in compressed files."""
+"""CCSDS AEM and OEM in XML; ephemerides of Horizons, in compressed files, and as CSV and TUM text."""
 
+import csv
 import gzip
 import io
 import zipfile
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,17 +12,19 @@ from hypothesis import given
 from hypothesis import strategies as st
 from lxml import etree
 from numpy.testing import assert_allclose, assert_array_equal
+from scipy.spatial.transform import Rotation
 
 from lunar.constants import NS
 from lunar.datafolder import read_expanded
-from lunar.ephemeris import Covariance, Ephemeris, EphemerisSegment
+from lunar.ephemeris import Covariance, Ephemeris, EphemerisSegment, ephemeris_from_states
 from lunar.errors import DataFileError, EphemerisError, TimeFormatError, UnknownFrameError
-from lunar.frames import continuous_quaternions, matrix_from_quaternion
+from lunar.frames import IauOrientation, continuous_quaternions, matrix_from_quaternion, rtn_from_inertial
 from lunar.messages.aem import AttitudeSegment, format_aem, parse_aem
 from lunar.messages.ephemeris_files import load_ephemeris
 from lunar.messages.oem import format_oem
 from lunar.messages.oem_xml import format_oem_xml, parse_oem_xml
-from lunar.timescales import from_tai_ns, parse_tai, parse_utc
+from lunar.messages.stk import format_csv, format_tum
+from lunar.timescales import from_tai_ns, parse_tai, parse_utc, utc_ns_from_tai_ns
 
 START = parse_utc("2029-08-07T00:00:00")
 
@@ -293,13 +297,10 @@ AEM_XML = """<?xml version="1.0" encoding="UTF-8"?>
 </data></segment></body></aem>"""
 
 
-def test_an_aem_in_xml_is_read_by_the_names_of_its_elements():
+def test_an_aem_in_xml_is_read_by_its_elements_and_a_missing_scalar_is_named_with_its_line():
     (segment,) = parse_aem(AEM_XML)
     assert_array_equal(segment.utc_ns, START + np.array([0, 15]) * NS)
     assert_allclose(segment.q_wxyz, [[0.6, 0, -0.8, 0], [0, 0, 0, -1.0]], atol=1e-15)
-
-
-def test_a_quaternion_in_xml_without_its_scalar_is_named_with_its_line():
     with pytest.raises(DataFileError, match=r"line 8: expected <QC> with one value, found 'none'"):
         parse_aem(AEM_XML.replace("<QC>0.6</QC>", ""))
 
@@ -409,3 +410,36 @@ def test_an_spk_is_referred_to_the_converter(tmp_path):
     path.write_bytes(b"DAF/SPK " + bytes(100))
     with pytest.raises(DataFileError, match="found a SPICE kernel; convert it with 'linna orbit convert'"):
         load_ephemeris(path)
+
+
+ANGLE = np.arange(20)[:, None] * 0.3
+POSITION_M = 1_768_180.0 * np.concatenate([np.cos(ANGLE), 0.6 * np.sin(ANGLE), 0.8 * np.sin(ANGLE)], 1)
+VELOCITY_M_S = 1665.0 * np.concatenate([-np.sin(ANGLE), 0.6 * np.cos(ANGLE), 0.8 * np.cos(ANGLE)], 1)
+EPHEMERIS = ephemeris_from_states(START + np.arange(20) * 300 * NS + 1, POSITION_M, VELOCITY_M_S)
+
+
+def test_csv_holds_states_and_places_with_their_units():
+    rows = list(csv.DictReader(io.StringIO(format_csv(EPHEMERIS, IauOrientation()))))
+    assert len(rows) == 20
+    assert rows[1]["utc"] == "2029-08-07T00:05:00.000000001Z"
+    assert abs(float(rows[7]["y_km"]) * 1e3 - POSITION_M[7, 1]) < 1e-6
+    assert all(0.0 <= float(row["longitude_deg"]) < 360.0 for row in rows)
+    assert abs(float(rows[0]["altitude_km"]) - 30.78) < 1e-6
+
+
+def test_tum_has_no_place_for_a_state_within_a_leap_second():
+    (one,) = EPHEMERIS.segments
+    moved = one.tai_ns - one.tai_ns[3] + parse_tai("2016-12-31T23:59:60.5")
+    leap = replace(one, tai_ns=moved, utc_ns=utc_ns_from_tai_ns(moved))
+    with pytest.raises(EphemerisError, match=r"outside of leap seconds, found 2016-12-31T23:59:60\.500Z"):
+        format_tum(Ephemeris((leap,)))
+
+
+def test_tum_holds_metres_and_the_attitude_of_the_rtn_axes_scalar_last():
+    table = np.loadtxt(io.StringIO(format_tum(EPHEMERIS)))
+    assert table.shape == (20, 8)
+    assert table[3, 0] == START // NS + 900
+    assert np.allclose(table[:, 1:4], POSITION_M, atol=1e-6, rtol=0)
+    # SciPy keeps quaternions scalar last too; its matrix takes body axes to the world.
+    theirs = Rotation.from_quat(table[:, 4:]).as_matrix()
+    assert np.allclose(theirs, np.swapaxes(rtn_from_inertial(POSITION_M, VELOCITY_M_S), 1, 2), atol=1e-10)

@@ -70,36 +70,26 @@ def test_what_is_written_is_read_back_to_a_micrometre(tmp_path):
     assert back.segments[0].degree == 7
 
 
-def test_segments_that_meet_are_written_with_their_boundary():
+def test_segments_that_meet_are_written_with_their_boundary_and_those_with_a_gap_refused():
     first, second = EphemerisSegment(*states(20)), EphemerisSegment(*states(20, 570.0))
     text = format_stk(Ephemeris((first, second)))
     assert "BEGIN SegmentBoundaryTimes\n570.000000000\nEND" in text
     assert [len(s.utc_ns) for s in parse_stk(text).segments] == [20, 20]
-
-
-def test_a_gap_between_segments_cannot_be_written():
     first, second = EphemerisSegment(*states(20)), EphemerisSegment(*states(20, 900.0))
     with pytest.raises(EphemerisError, match="found a gap"):
         format_stk(Ephemeris((first, second)))
 
 
-def test_a_boundary_listed_for_a_single_state_splits_there_too():
+def test_a_boundary_at_a_state_also_a_rounded_one_splits_there_and_accelerations_are_passed_over():
     text = EXAMPLE.replace("Points  5", "Points  4").replace(EXAMPLE.splitlines(keepends=True)[23], "")
     assert [len(s.utc_ns) for s in parse_stk(text).segments] == [3, 2]
-
-
-def test_boundaries_may_be_rounded_and_one_without_a_state_is_refused():
-    single = EXAMPLE.replace("Points  5", "Points  4").replace(EXAMPLE.splitlines(keepends=True)[23], "")
     boundary = "1.2000000000e+02"
-    rounded = single.replace(boundary, f"{float(boundary) + 4e-7:.9f}")
+    rounded = text.replace(boundary, f"{float(boundary) + 4e-7:.9f}")
     assert [len(s.utc_ns) for s in parse_stk(rounded).segments] == [3, 2]
     with pytest.raises(
         DataFileError, match=r"SegmentBoundaryTimes: expected times of states, found .*Z, at which there"
     ):
-        parse_stk(single.replace(boundary, f"{float(boundary) - 7.0:.3f}"))
-
-
-def test_accelerations_are_passed_over():
+        parse_stk(text.replace(boundary, f"{float(boundary) - 7.0:.3f}"))
     text = EXAMPLE.replace("EphemerisTimePosVel", "EphemerisTimePosVelAcc").replace("1.0e-01\n", "1.0e-01 0 0 0\n")
     assert len(parse_stk(text).utc_ns) == 4
 

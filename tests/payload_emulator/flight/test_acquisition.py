@@ -111,23 +111,17 @@ def test_the_sag_is_constant_up_to_the_design_altitude():
     assert {acquisition._sag(1e3 * km, 1.18) for km in (14.0, 50.0, 100.0)} == {0.05}
 
 
-def test_a_place_outside_the_search_is_not_found():
+def test_a_place_outside_the_search_false_detections_and_two_detections_give_no_place():
     landmarks, true = crater_map(), pose_at()
     found, _ = detected(landmarks, true)
     prior = pose_at(20_000.0)
     assert search(found, landmarks, prior, 7_000.0) is not None
     # 3.5 sigma are 7 km; cells at the edge of the search and the fit reach 5 km farther.
     assert search(found, landmarks, prior, 2_000.0) is None
-
-
-def test_false_detections_alone_give_no_place():
     landmarks = crater_map()
     for seed in range(12):
         found, _ = detected(landmarks, pose_at(), keep=0.0, false=14, seed=seed)
         assert search(found, landmarks, pose_at(), 5_000.0) is None
-
-
-def test_two_detections_are_never_searched():
     landmarks = crater_map()
     found, owner = detected(landmarks, pose_at(), noise_px=0.0, false=0)
     for count in (0, 1, 2):
@@ -162,16 +156,13 @@ def test_two_places_that_explain_as_much_are_no_place():
     assert search(found, double, prior, 5_000.0) is None
 
 
-def test_sizes_that_do_not_fit_keep_pairs_apart():
+def test_sizes_that_do_not_fit_and_a_mirrored_image_give_no_place():
     landmarks, true = crater_map(), pose_at()
     found, _ = detected(landmarks, true, false=0)
     assert search(found, landmarks, pose_at(3_000.0), 3_000.0) is not None
     # Three times the size is 1.1 in the logarithm, beyond a gate of 0.45 at any altitude of the search.
     grown = replace(found, diameter_px=3.0 * found.diameter_px)
     assert search(grown, landmarks, pose_at(3_000.0), 1_000.0) is None
-
-
-def test_a_mirrored_image_is_no_place():
     landmarks = crater_map()
     found, _ = detected(landmarks, pose_at())
     assert search(replace(found, u_px=511.0 - found.u_px), landmarks, pose_at(), 5_000.0) is None

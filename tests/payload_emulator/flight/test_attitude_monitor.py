@@ -109,15 +109,12 @@ def test_wrong_pairs_in_two_of_five_frames_are_no_bad_sensor():
     assert not any(one.degraded for one in judged(good + bad[:1] + good[:1] + bad[1:] + good[:5]))
 
 
-def test_the_declared_noise_is_used_again_once_the_sensor_is_restored():
+def test_the_declared_noise_is_used_again_once_the_sensor_is_restored_and_none_above_the_limit():
     noisy = judged(frames(40, np.radians(0.5)))[-1]
     assert noisy.degraded
     after = judged(frames(30, DECLARED, seed=5, used_rad=noisy.noise_rad), noisy)
     assert after[0].degraded and not after[-1].degraded
     assert after[-1].noise_rad == 0.0 and after[-1].sigma_rad(DECLARED) == DECLARED
-
-
-def test_no_noise_above_the_limit_is_used():
     assert judged(frames(30, np.radians(6.0)))[-1].noise_rad == RULES.largest_rad
 
 

@@ -48,16 +48,13 @@ def detections(**columns):
     return Detections(**{name: np.array(column, float) for name, column in values.items()})
 
 
-def test_the_hash_of_a_network_does_not_depend_on_its_metadata(plain):
+def test_the_hash_of_a_network_does_not_depend_on_its_metadata_which_are_loaded_as_stored(plain):
     other = with_metadata(plain, {"a": "b" * 300, "c": "é"})
     assert network_sha256(other) == network_sha256(plain) == network_sha256(load_shipped_model())
     assert OnnxDetector(other).metadata == {"a": "b" * 300, "c": "é"}
     changed = bytearray(plain)
     changed[len(changed) // 2] ^= 1
     assert network_sha256(bytes(changed)) != network_sha256(plain)
-
-
-def test_what_was_stored_is_what_is_loaded(plain):
     assert OnnxDetector(calibrated(plain, SIGMA)).calibration == SIGMA
     assert OnnxDetector(plain).calibration is None
 

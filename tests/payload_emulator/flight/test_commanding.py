@@ -57,14 +57,11 @@ def test_octets_too_few_for_a_packet_are_refused_by_what_there_is_of_its_name(ke
     assert found == Refusal(named, BAD_LENGTH)
 
 
-def test_a_packet_shorter_than_any_telecommand_is_refused_and_ends_the_reading():
+def test_a_packet_too_short_for_a_telecommand_or_for_its_fields_has_a_wrong_length():
     """13 octets are the shortest; a length field of 5 says 12."""
     short = packet(5)[:4] + (5).to_bytes(2, "big") + bytes(6)
     assert list(parse_commands(short + packet(6))) == [Refusal(request(5), BAD_LENGTH)]
-
-
-def test_fields_that_are_missing_make_a_wrong_length():
-    """Service 8, subtype 1 carries a function and two arguments, 18 octets."""
+    # Service 8, subtype 1 carries a function and two arguments, 18 octets.
     full = packet(9, bytes([0, 1]) + bytes(16), service=8)
     assert isinstance(next(parse_commands(full)), Command)
     for octets in (17, 8, 0):
@@ -97,13 +94,10 @@ def test_counts_go_forward_by_less_than_half_of_their_range(count, code):
     assert noted(packet(100)).judge(packet(count, acknowledge=1)) == code
 
 
-def test_a_count_wraps():
+def test_a_count_wraps_and_the_first_command_of_a_source_may_have_any():
     history = noted(packet(16_383))
     assert history.judge(packet(0)) == 0 and history.judge(packet(8_190)) == 0
     assert history.judge(packet(8_191)) == OUT_OF_SEQUENCE
-
-
-def test_the_first_command_of_a_source_may_have_any_count():
     history = CommandHistory()
     assert history.judge(packet(9_000)) == 0
     history.note(packet(9_000))
@@ -132,14 +126,11 @@ def test_a_command_out_of_band_moves_no_count():
     assert history.judge(packet(101)) == 0 and history.judge(packet(60)) == OUT_OF_SEQUENCE
 
 
-def test_the_last_256_commands_are_remembered():
+def test_the_last_256_commands_and_the_last_sixteen_sources_are_remembered():
     history = noted(*(packet(count) for count in range(257)))
     assert history.judge(packet(0), in_sequence=False) == 0
     assert history.judge(packet(1), in_sequence=False) == DUPLICATE
     assert history.judge(packet(256), in_sequence=False) == DUPLICATE
-
-
-def test_the_last_sixteen_sources_are_remembered():
     history = noted(*(packet(100, source=source) for source in range(16)))
     history.note(packet(101, source=0))  # received again: the second is now the one longest silent
     history.note(packet(100, source=16))

@@ -1,15 +1,18 @@
-"""The flight detector with the shipped network: coordinates, bad input, bad models."""
+"""The flight detector with the shipped network: coordinates, bad input, single pictures, preparation."""
 
 import hashlib
 import json
 
 import numpy as np
+from hypothesis import given
+from hypothesis import strategies as st
 from pytest import approx, fixture, mark, raises
 
 from payload_emulator.errors import ModelError
 from payload_emulator.flight.models import load_shipped_model
 from payload_emulator.flight.vision.detections import Detections, states
 from payload_emulator.flight.vision.detector import (
+    MANY_DETECTIONS,
     DetectorParameters,
     OnnxDetector,
     _tile_starts,
@@ -18,10 +21,27 @@ from payload_emulator.flight.vision.detector import (
     drop_duplicates,
     remove_parallax,
 )
-from payload_emulator.flight.vision.preprocess import ImageQuality
+from payload_emulator.flight.vision.picture_search import (
+    SMALL_CRATERS_PX,
+    _merge,
+    _squares,
+    _walls,
+    enlarge,
+    find_sun,
+    search_picture,
+    sun_at_azimuth,
+)
+from payload_emulator.flight.vision.preprocess import (
+    ImageQuality,
+    gray_levels,
+    prepare_image,
+    sun_up_turns,
+    turn_back,
+    turn_forward,
+)
 from tests.lazy import Lazy
+from tests.payload_emulator.bowls import BOWL_CENTRES, bowl_image
 from tests.payload_emulator.bowls import BOWL_CENTRES as CENTRES
-from tests.payload_emulator.bowls import bowl_image
 
 onnx = Lazy("onnx")
 
@@ -116,12 +136,9 @@ def test_the_shipped_network_is_small_and_tells_what_it_is(detector):
     assert set(tested) == {"real-strip", "real-block", "procedural-world"}
 
 
-def test_a_network_of_another_hash_is_refused():
+def test_a_network_of_another_hash_and_octets_that_are_none_are_refused():
     with raises(ModelError, match="expected SHA-256 00"):
         OnnxDetector(load_shipped_model(), expected_sha256="00" * 32)
-
-
-def test_octets_that_are_no_network_are_refused():
     with raises(ModelError, match="expected an ONNX model"):
         OnnxDetector(b"not a network")
     with raises(ModelError, match="expected an ONNX model"):
@@ -188,14 +205,11 @@ def test_craters_on_the_very_edge_of_the_heatmap_are_decoded():
     assert sorted(zip(found.u_px, found.v_px, strict=True)) == [(1.5, 1.5), (509.5, 509.5)]
 
 
-def test_a_weaker_repetition_is_dropped_and_a_nested_crater_kept():
+def test_a_weaker_repetition_is_dropped_and_a_nested_crater_and_what_it_repeats_stay():
     columns = ([100, 104, 102], [100, 101, 100], [40, 44, 12], [0.9, 0.8, 0.7], [1, 1, 1])
     found = Detections(*(np.array(column, float) for column in columns))
     kept = drop_duplicates(found, DetectorParameters())
     assert kept.diameter_px.tolist() == [40, 12]
-
-
-def test_what_a_dropped_repetition_would_have_dropped_stays():
     # The second repeats the first and goes; the third repeats only the second, so it is a crater of its own.
     found = detections([100, 108, 116], [100, 100, 100], diameter=30.0)
     assert drop_duplicates(found, DetectorParameters()).u_px.tolist() == [100, 116]
@@ -221,3 +235,218 @@ def test_classes_give_median_diameters_and_the_best_class_of_a_place_counts():
     assert found.diameter_m.tolist() == [6e3, 20e3, 6e3]
     assert found.u_px.tolist() == [4 * column + 1.5 for column in (20, 80, 90)]
     assert found.v_px.tolist() == [4 * row + 1.5 for row in (50, 80, 80)]
+
+
+def off_deg(found, true):
+    return abs((found - true + 180.0) % 360.0 - 180.0)
+
+
+@mark.parametrize("azimuth", [0.0, 30.0, 90.0, 130.0, 180.0, 250.0, 270.0, 330.0])
+def test_the_azimuth_of_the_sun_is_found_from_the_craters(detector, azimuth):
+    sun = find_sun(detector, prepare_image(bowl_image(sun_azimuth_deg=azimuth)).gray)
+    # Bowls have no ejecta and no neighbours, so a few degrees is what their walls can tell.
+    assert off_deg(sun.azimuth_deg, azimuth) < 8.0
+    assert sun.craters >= len(BOWL_CENTRES)
+    assert sun.determined and sun.confidence > 0.99
+    assert int(np.argmax(sun.evidence)) in (int(azimuth // 90), int(-(-azimuth // 90)) % 4)
+
+
+def test_a_picture_without_its_sun_gives_what_the_picture_with_it_gives(detector):
+    image = bowl_image(sun_azimuth_deg=200.0)
+    given = search_picture(detector, image, sun_at_azimuth(200.0))
+    found = search_picture(detector, image)
+    assert given.sun is None and found.sun is not None
+    assert found.detections.u_px.tolist() == given.detections.u_px.tolist()
+    assert found.detections.score.tolist() == given.detections.score.tolist()
+    assert len(found.detections) >= len(BOWL_CENTRES)
+    straight = detector.examine_any_size(image, sun_at_azimuth(200.0))[1]
+    assert straight.v_px.tolist() == given.detections.v_px.tolist()
+
+
+def test_craters_of_two_opposite_suns_leave_it_undetermined(detector):
+    both = np.hstack([bowl_image(sun_azimuth_deg=azimuth) for azimuth in (0.0, 180.0)])
+    sun = find_sun(detector, prepare_image(both).gray)
+    assert not sun.determined and 0.5 <= sun.confidence < 0.95
+
+
+def test_a_slope_is_no_evidence_of_a_crater():
+    plane = np.mgrid[0:40, 0:40][0].astype(np.float32)
+    _, evidence = _walls(plane, Detections(*np.array([[20.0], [20.0], [16.0], [0.9], [1.0]])))
+    assert evidence.tolist() == [0.0]
+
+
+def test_nothing_to_be_seen_gives_no_sun_and_a_dark_picture_is_a_verdict(detector):
+    noise = np.random.default_rng(3).integers(90, 110, (300, 400)).astype(np.uint8)
+    outcome = search_picture(detector, noise)
+    assert outcome.quality is ImageQuality.OK
+    assert outcome.sun is None
+    outcome = search_picture(detector, np.zeros((64, 64), np.uint8))
+    assert outcome.quality is ImageQuality.DARK
+    assert len(outcome.detections) == 0 and outcome.sun is None
+
+
+def test_craters_of_eight_pixels_are_found_at_two_scales(detector):
+    centres = [(60.0 + 90.0 * i, 60.0 + 90.0 * j) for i in range(5) for j in range(5)]
+    image = bowl_image(centres, radius=4.0)
+
+    def found_share(outcome):
+        found = outcome.detections
+        return np.mean([(np.hypot(found.u_px - u, found.v_px - v) < 2.5).any() for u, v in centres])
+
+    one = search_picture(detector, image, sun_at_azimuth(0.0))
+    two = search_picture(detector, image, sun_at_azimuth(0.0), two_scales=True)
+    assert found_share(two) > 0.9
+    assert found_share(one) < 0.3
+    near = two.detections.select(two.detections.score > 0.44)
+    assert np.median(near.diameter_px) == approx(8.0, rel=0.25)
+
+
+def test_what_one_scale_finds_two_scales_find(detector):
+    def found(*rows):
+        u, diameter, score = np.array(rows).T
+        return Detections(u, np.full(u.size, 100.0), diameter, score, np.ones(u.size))
+
+    coarse = found((100.0, 60.0, 0.9), (200.0, 30.0, 0.5))
+    fine = found((300.0, 20.0, 0.8), (101.0, 44.0, 0.6), (400.0, 2.0 * SMALL_CRATERS_PX, 0.4))
+    assert _merge(coarse, fine, detector).u_px.tolist() == [100.0, 300.0, 200.0]
+
+
+def test_enlarging_puts_pixel_x_at_two_x_and_a_half():
+    row, column = np.mgrid[0:20, 0:30].astype(np.float32)
+    larger = enlarge(2.0 * column + 3.0 * row)
+    assert larger.shape == (40, 60)
+    down, right = np.mgrid[0:40, 0:60]
+    expected = 2.0 * (right - 0.5) / 2.0 + 3.0 * (down - 0.5) / 2.0
+    # A cubic kernel is exact on a plane, away from the edges that it repeats.
+    assert larger[4:-4, 4:-4] == approx(expected[4:-4, 4:-4], abs=1e-4)
+
+
+@mark.parametrize(
+    ("shape", "count"), [((512, 512), 4), ((351, 640), 4), ((200, 300), 2), ((100, 90), 1), ((2000, 3000), 4)]
+)
+def test_evidence_comes_from_up_to_four_squares(shape, count):
+    squares = _squares(np.zeros(shape, np.float32))
+    assert len(squares) == count
+    assert all(square.shape == (min(256, shape[0]), min(256, shape[1])) for square in squares)
+
+
+def random_detections(count, seed, side):
+    rng = np.random.default_rng(seed)
+    diameter = np.exp(rng.normal(3.0, 0.8, count))
+    diameter[:: max(1, count // 7)] = np.nan
+    return Detections(
+        rng.uniform(0, side, count), rng.uniform(0, side, count), diameter, np.sort(rng.uniform(0, 1, count))[::-1],
+        np.ones(count)
+    )  # fmt: skip
+
+
+@mark.parametrize("seed", range(5))
+def test_many_detections_lose_the_same_duplicates_as_few(monkeypatch, seed):
+    found = random_detections(MANY_DETECTIONS - 1, seed, 300.0)
+    each_with_each = drop_duplicates(found, DetectorParameters())
+    assert len(each_with_each) < len(found)
+    monkeypatch.setattr("payload_emulator.flight.vision.detector.MANY_DETECTIONS", 0)
+    by_neighbours = drop_duplicates(found, DetectorParameters())
+    assert by_neighbours.u_px.tolist() == each_with_each.u_px.tolist()
+
+
+def test_memory_does_not_grow_with_the_square_of_the_detections():
+    # Each with each would take 200,000 squared: 320 GB for one table of distances.
+    found = random_detections(200_000, 1, 40_000.0)
+    assert 0 < len(drop_duplicates(found, DetectorParameters())) <= len(found)
+
+
+def texture(shape=(512, 512, 3), dtype=np.uint8):
+    rng = np.random.default_rng(0)
+    smooth = 100 + 60 * np.sin(np.arange(shape[1]) / 9.0)[None, :] * np.cos(np.arange(shape[0]) / 7.0)[:, None]
+    image = smooth + rng.normal(0, 4, shape[:2])
+    if len(shape) == 3:
+        image = np.repeat(image[..., None], shape[2], axis=2)
+    full = np.iinfo(dtype).max / 255.0
+    return np.clip(image * full, 0, np.iinfo(dtype).max).astype(dtype)
+
+
+def test_a_good_frame_has_zero_mean_and_unit_deviation_whatever_its_depth_and_colour():
+    prepared = prepare_image(texture())
+    assert prepared.quality is ImageQuality.OK
+    # Clipping at four deviations moves both by far less than a hundredth.
+    assert float(prepared.gray.mean()) == approx(0.0, abs=0.01)
+    assert float(prepared.gray.std()) == approx(1.0, abs=0.01)
+    reference = prepare_image(texture()).gray
+    for other in (
+        texture(shape=(512, 512)),
+        texture(dtype=np.uint16),
+        texture(shape=(512, 512, 1)),
+        texture().astype(np.float32) / 255.0,
+    ):
+        # One count of 255 at mid scale, in deviations of this scene.
+        assert np.abs(prepare_image(other).gray - reference).max() < 0.06
+
+
+@mark.parametrize("shape", [(512, 512), (512, 512, 3), (300, 200, 4), (64, 64, 1)])
+def test_eight_bits_go_a_quicker_way_to_the_same_values(shape):
+    image = np.random.default_rng(1).integers(0, 256, shape, dtype=np.uint8)
+    colours = image if image.ndim == 2 else image[..., : 3 if shape[2] >= 3 else 1].mean(axis=2)
+    # Rounding of 32-bit numbers up to 4 and the order of sums.
+    assert prepare_image(image).gray == approx(prepare_image(colours / 255.0).gray, abs=5e-6)
+
+
+def test_half_the_exposure_gives_the_same_input():
+    bright = texture(dtype=np.uint16)
+    reference = prepare_image(bright).gray
+    assert np.abs(prepare_image(bright // 2).gray - reference).max() < 1e-3
+
+
+@mark.parametrize(
+    ("image", "verdict"),
+    [
+        (np.zeros((512, 512, 3), np.uint8), ImageQuality.DARK),
+        (np.full((512, 512, 3), 4, np.uint8), ImageQuality.DARK),
+        (np.full((512, 512, 3), 255, np.uint8), ImageQuality.SATURATED),
+        (np.full((512, 512), 65535, np.uint16), ImageQuality.SATURATED),
+        (np.full((512, 512, 3), 120, np.uint8), ImageQuality.UNIFORM),
+        (np.full((512, 512), np.nan, np.float32), ImageQuality.INVALID),
+        (np.zeros((512, 512, 2), np.uint8), ImageQuality.INVALID),
+        (np.zeros((0, 0), np.uint8), ImageQuality.INVALID),
+        (np.zeros(512, np.uint8), ImageQuality.INVALID),
+        (np.zeros((512, 512), np.complex64), ImageQuality.INVALID),
+        (np.zeros((2, 2, 2, 2), np.uint8), ImageQuality.INVALID),
+    ],
+)
+def test_a_frame_that_cannot_be_searched_is_a_verdict(image, verdict):
+    assert prepare_image(image).quality is verdict
+
+
+def test_gray_levels_round_to_the_nearest_count_and_one_that_is_no_number_is_invalid():
+    image = texture(shape=(64, 64)).astype(np.float32) / 255.0
+    image[3, 5] = np.inf
+    assert prepare_image(image).quality is ImageQuality.INVALID
+    image = np.array([[[1, 1, 2], [255, 255, 255], [0, 0, 1]]], np.uint8)
+    assert gray_levels(image).tolist() == [[1, 255, 0]]
+
+
+@given(st.floats(0.0, 2.0 * np.pi))
+def test_after_the_turns_the_sun_is_within_45_degrees_of_the_top(azimuth):
+    sun = np.array([np.sin(azimuth), -np.cos(azimuth), 0.3])
+    turns = sun_up_turns(sun)
+    # Follow a point from the middle toward the Sun.
+    u, v = turn_forward(np.array([255.5 + 100 * sun[0]]), np.array([255.5 + 100 * sun[1]]), turns, 512, 512)
+    assert 255.5 - v[0] >= 100 * np.cos(np.pi / 4) - 1e-6
+    assert abs(u[0] - 255.5) <= 100 * np.sin(np.pi / 4) + 1e-6
+
+
+@mark.parametrize("turns", [0, 1, 2, 3])
+def test_turned_coordinates_point_at_the_same_pixel_and_come_back(turns):
+    image = np.arange(6 * 9).reshape(6, 9)
+    turned = np.rot90(image, turns)
+    for row in range(6):
+        for column in range(9):
+            u, v = turn_forward(np.array([float(column)]), np.array([float(row)]), turns, 6, 9)
+            assert turned[int(v[0]), int(u[0])] == image[row, column]
+            back_u, back_v = turn_back(u, v, turns, 6, 9)
+            assert (back_u[0], back_v[0]) == (column, row)
+
+
+@mark.parametrize("sun", [None, np.array([np.nan, np.nan, np.nan]), np.array([0.0, 0.0, 1.0])])
+def test_without_a_sun_direction_the_frame_stays_as_it_is(sun):
+    assert sun_up_turns(sun) == 0

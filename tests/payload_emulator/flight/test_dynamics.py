@@ -42,7 +42,7 @@ def start_state():
     return np.concatenate([position, velocity, np.zeros(3)])
 
 
-def test_an_orbit_on_board_is_that_of_the_library_to_a_centimetre_after_an_hour():
+def test_an_orbit_on_board_is_that_of_the_library_to_a_centimetre_and_ends_where_it_began():
     state, epoch_s = start_state(), float(tdb_s_from_utc_ns(EPOCH))
     predicted = model().propagate(state, START, START + 3_600 * 65_536)
     expected = propagate(epoch_s, state[:3], state[3:6], 3_700.0, ForceModel(builtin_gravity(), MOON)).state(
@@ -50,9 +50,6 @@ def test_an_orbit_on_board_is_that_of_the_library_to_a_centimetre_after_an_hour(
     )
     assert_allclose(predicted.state[:3], expected[:3], atol=0.01)
     assert_allclose(predicted.state[3:6], expected[3:], atol=1e-5)
-
-
-def test_going_forth_and_back_ends_where_it_began():
     orbit, state = model(), start_state()
     there = orbit.propagate(state, START, START + 1_800 * 65_536)
     back = orbit.propagate(there.state, START + 1_800 * 65_536, START)

@@ -1,6 +1,4 @@
-"""Number of agreeing pairs that a set needs, and its contents. Pairs of anonymous craters between two frames.
-Craters projected from the on-board catalogue, and the derivatives the filter lives on.
-"""
+"""Pairs of detections with catalogued and anonymous craters; projections and their derivatives."""
 
 import math
 
@@ -79,33 +77,24 @@ def test_one_crater_is_enough_where_the_prediction_is_good_and_not_where_it_is_b
     assert run(lone, sighting(places), sigma_px=60.0) == []
 
 
-def test_a_crater_of_another_size_is_no_match():
+def test_pairs_are_of_one_size_use_each_crater_once_and_need_detections_and_craters():
     places = np.array([[100.0, 100.0], [300.0, 200.0]])
     assert run(found(places, diameter=60.0), sighting(places), sigma_px=1.0) == []
-
-
-def test_each_detection_and_each_crater_is_used_once():
     places = np.array([[100.0, 100.0], [102.0, 101.0], [300.0, 300.0]])
     pairs = run(found(np.concatenate([places, places[:1] + 0.4])), sighting(places), sigma_px=1.0)
     assert len({i for i, _ in pairs}) == len(pairs) == len({j for _, j in pairs})
-
-
-def test_no_detections_and_no_craters_make_no_set():
     nothing = np.empty((0, 2))
     assert run(found(nothing), sighting(np.array([[5.0, 5.0]])), 1.0) == []
     assert run(found(np.array([[5.0, 5.0]])), sighting(nothing), 1.0) == []
 
 
-def test_a_frame_full_of_detections_that_craters_hardly_explain_is_believed_less():
+def test_frames_that_craters_hardly_explain_and_lone_pairs_that_move_the_place_are_not_believed():
     places = default_rng(5).uniform(20.0, 490.0, (25, 2))
     few = places[:4] + 0.5
     clutter = default_rng(6).uniform(0.0, 511.0, (20, 2))
     assert run(found(few), sighting(places), sigma_px=3.0) == [(k, k) for k in range(4)]
     crowded = found(np.concatenate([few, clutter]))
     assert not {(k, k) for k in range(4)} <= set(run(crowded, sighting(places), sigma_px=3.0))
-
-
-def test_a_lone_pair_is_refused_where_it_would_move_the_place_farther_than_it_then_claims():
     places = default_rng(3).uniform(20.0, 490.0, (4, 2))
     lone = found(places[:1] + 0.5)
     # Chance puts a detection into one of four gates less than once in a hundred frames either way; where the prediction
@@ -152,7 +141,7 @@ def test_the_common_shift_is_found_whatever_the_order_of_detections(seed, count,
     assert np.unique(match.earlier).size == len(match) == np.unique(match.later).size
 
 
-def test_the_densest_cluster_wins_over_clutter_of_the_same_class():
+def test_the_densest_cluster_wins_over_clutter_and_craters_of_different_class_never_pair():
     rng = default_rng(7)
     common = rng.uniform(-40e3, 40e3, (6, 2))
     clutter = rng.uniform(-50e3, 50e3, (2, 6, 2))
@@ -161,9 +150,6 @@ def test_the_densest_cluster_wins_over_clutter_of_the_same_class():
     match = match_frames(earlier, later, 15.0, 1)
     pairs = set(zip(match.earlier.tolist(), match.later.tolist(), strict=True))
     assert {(k, k) for k in range(6)} <= pairs
-
-
-def test_craters_of_different_class_never_pair():
     earlier = features([[0.0, 10e3], [5e3, 12e3]], [0, 1])
     later = GroundFeatures(earlier.east_m, earlier.north_m - 24.5e3, np.array([1, 2]))
     assert len(match_frames(earlier, later, 15.0, 1)) == 0
@@ -183,7 +169,7 @@ def test_the_paper_bounds_at_30_s_are_halved_at_15_s(shift, inside):
     assert match_frames(earlier, moved(earlier, *shift), 15.0, 1).candidate_pairs == (2 if inside else 0)
 
 
-def test_too_small_a_cluster_falls_back_to_the_class_with_one_crater_in_each_frame():
+def test_small_clusters_fall_back_to_lone_classes_shared_craters_count_once_and_the_nearest_is_kept():
     # Two pairs that disagree by more than tau: one of a class seen once in each frame, one that is not.
     earlier = features([[0.0, 10e3], [3e3, 0.0], [-20e3, 40e3]], [2, 0, 0])
     later = features([[0.0, 10e3 - 25e3], [3e3, 0.0 - 30e3]], [2, 0])
@@ -191,31 +177,22 @@ def test_too_small_a_cluster_falls_back_to_the_class_with_one_crater_in_each_fra
     assert not match.from_cluster
     assert match.candidate_pairs == 2
     assert (match.earlier.tolist(), match.later.tolist()) == ([0], [0])
-
-
-def test_two_pairs_that_share_a_crater_are_not_two_pieces_of_evidence():
     earlier = features([[0.0, 10e3], [500.0, 10.5e3]], [0, 0])
     later = features([[0.0, 10e3 - 25e3]], [0])
     match = match_frames(earlier, later, 15.0, 1)
     assert match.candidate_pairs == 2
     assert len(match) == 0
-
-
-def test_of_disagreeing_lone_pairs_the_one_nearest_the_orbital_prior_is_kept():
     earlier = features([[0.0, 10e3], [3e3, 0.0]], [1, 2])
     later = features([[0.0, 10e3 - 19e3], [3e3, -25e3]], [1, 2])
     match = match_frames(earlier, later, 15.0, 1)
     assert match.earlier.tolist() == [1]
 
 
-def test_empty_frames_match_nothing():
+def test_empty_frames_match_nothing_and_a_frame_full_of_false_detections_stays_bounded():
     nothing, some = features(np.empty((0, 2)), []), features([[0.0, 0.0]], [0])
     for earlier, later in ((nothing, some), (some, nothing), (nothing, nothing)):
         match = match_frames(earlier, later, 15.0, 1)
         assert (len(match), match.candidate_pairs) == (0, 0)
-
-
-def test_a_frame_full_of_false_detections_stays_bounded():
     rng = default_rng(1)
     crowd, again = (features(rng.uniform(-50e3, 50e3, (255, 2)), np.zeros(255)) for _ in range(2))
     match = match_frames(crowd, again, 15.0, 1)

@@ -188,7 +188,7 @@ def test_nothing_is_mapped_while_the_spacecraft_does_not_know_where_it_is_or_see
     assert Mapper().observe(lost, found, one, np.ones(1, bool), 0.0) == ()
 
 
-def test_detections_that_are_no_numbers_are_left_out():
+def test_detections_that_are_no_numbers_or_on_a_catalogued_crater_are_not_free():
     mapper = Mapper()
     place = mcmf_from_spherical(0.0, 0.0, 30e3)
     view = View(0, nadir_camera_from_mcmf(place), place, np.eye(3), 1e-4)
@@ -198,9 +198,6 @@ def test_detections_that_are_no_numbers_are_left_out():
     for k in range(4):
         mapper.observe(replace(view, ticks=k * SECOND), found, np.ones(3), np.ones(3, bool), 0.0)
     assert len(mapper.close()) == 1
-
-
-def test_a_detection_on_a_catalogued_crater_of_its_size_is_not_free():
     nothing, uv, size_px = np.zeros((1, 2, 3)), np.array([[100.0, 100.0]]), np.array([30.0])
     seen = Sighting(np.arange(1), uv, size_px, nothing, nothing, nothing, nothing[:, :, 0])
     u = np.array([105.0, 105.0, 300.0, 400.0])

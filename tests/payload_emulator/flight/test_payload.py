@@ -1,7 +1,4 @@
-"""The payload's door: frames and telecommands in, packets of the dictionary out. Every transition between modes,
-by telecommand, and what each mode allows. Settings that survive resets, interrupted writing and flipped bits.
-The document about the payload's ports, modes, parameters and faults is the current one, and complete.
-"""
+"""The payload: frames and telecommands in, packets out; modes, settings that survive, and its document."""
 
 import re
 
@@ -227,11 +224,8 @@ def written(*every):
     return memory
 
 
-def test_new_memory_is_blank():
+def test_new_memory_is_blank_and_the_newest_of_many_is_read():
     assert Settings(np.zeros(1000, np.uint8)).read() == (Recovery.blank, {})
-
-
-def test_the_newest_of_many_is_read():
     memory = written({"a": 1}, {"a": 2}, VALUES)
     settings = Settings(memory)
     assert settings.read() == (Recovery.whole, VALUES)
@@ -281,7 +275,7 @@ def test_a_set_of_settings_knows_the_generation_that_it_wrote():
         assert found.generation == settings.generation
 
 
-def test_every_port_parameter_and_restricted_command_is_in_it():
+def test_every_port_parameter_and_command_and_the_events_of_faults_are_in_the_document():
     text = format_interfaces()
     ports = [name for name in vars(Board) if not name.startswith("_") and callable(getattr(Board, name))]
     assert len(ports) > 8
@@ -291,9 +285,6 @@ def test_every_port_parameter_and_restricted_command_is_in_it():
         assert f"| {parameter.number} | {parameter.name} |" in text
     for name in ALLOWED:
         assert f"| {name} |" in text
-
-
-def test_the_events_of_the_table_of_faults_are_those_of_the_dictionary():
     known = set(DICTIONARY.labels("event_info", "event_id").values())
     rows = format_interfaces().split("## Faults")[1].splitlines()[4:]
     named = {event for row in rows if row for event in re.findall(r"\w+", row.split("|")[2])}

@@ -53,7 +53,7 @@ def test_only_the_classes_asked_for_are_sent():
     assert kept.waiting == 1
 
 
-def test_a_full_class_overwrites_its_oldest_and_leaves_the_others_alone():
+def test_a_full_class_overwrites_its_oldest_alone_and_begins_again_at_the_last_octet():
     kept = store()
     kept.append(packet(0), StoreClass.critical)
     room = int(SHARES[StoreClass.bulk] * 4000) // (HEADER + len(packet(0)))
@@ -61,9 +61,6 @@ def test_a_full_class_overwrites_its_oldest_and_leaves_the_others_alone():
         assert kept.append(packet(k), StoreClass.bulk)
     assert kept.overwritten == 3
     assert kept.take(1 << 20) == [packet(0), *(packet(k) for k in range(3, room + 3))]
-
-
-def test_a_class_that_is_full_to_the_last_octet_begins_again():
     # Four packets of 29 octets and their headers fill the class of the most important packets exactly.
     kept = store(round(4 * (29 + HEADER) / SHARES[0]))
     packets = [packet(k) for k in range(9)]

@@ -74,21 +74,15 @@ def test_displaced_vertices_lie_on_the_terrain(hilly, scene):
         assert height == approx(float(hilly.height_m(latitude, longitude)), abs=20.0)
 
 
-def test_the_displacement_texture_spans_0_to_1(scene):
+def test_the_scene_holds_the_footprint_toward_a_low_sun_its_displacement_and_the_axes_of_blender(scene):
     texture = scene.displacement
     assert texture.dtype == np.float32 and (texture.min(), texture.max()) == approx((0.0, 1.0), abs=1e-6)
-
-
-def test_the_cap_holds_the_footprint_and_reaches_toward_a_low_sun(scene):
     x, y = scene.vertices_km[..., 0], scene.vertices_km[..., 1]
     # Half the footprint of 120 degrees from 25 km is 43 km on flat ground.
     assert x.min() < -43.0 and y.min() < -43.0
     # The Sun stands 10 degrees high at azimuth 30: casters of 6 km shade ground 34 km on.
     assert y.max() > 43.0 + 25.0 and x.max() > 43.0 + 14.0
     assert y.max() < 140.0
-
-
-def test_camera_and_sun_are_in_blenders_axes(scene):
     camera = scene.camera_to_world
     assert_allclose(camera[:3, 3], [0.0, 0.0, 25.0], atol=1e-9)
     # Nadir, image up to the north: x east, y north, looking along -z.
@@ -152,19 +146,13 @@ def test_slopes_bend_the_base_colour_as_the_fast_renderer_shades_them(hilly):
         assert scene.albedo[place] / matt.albedo[place] == approx(ratio[v, u], rel=0.03)
 
 
-def test_a_tilted_camera_tilts(hilly):
+def test_a_tilted_camera_tilts_and_lenses_or_views_that_cannot_be_are_refused(hilly):
     position, rotation = pose()
     tilted = describe_scene(hilly, CAMERA, position, axis_rotation(1, 0.1) @ rotation, SUN)
     # The boresight, -z of Blender's camera, leans to the north.
     assert_allclose(-tilted.camera_to_world[:3, 2], [0.0, sin(0.1), -cos(0.1)], atol=1e-12)
-
-
-def test_a_distorting_lens_is_refused(hilly):
     with raises(RendererError, match="without distortion"):
         describe_scene(hilly, BrownCamera(k1=-0.01), *pose(), SUN)
-
-
-def test_a_camera_in_the_ground_and_a_view_along_the_horizon_are_refused(hilly):
     with raises(TerrainError, match="above the ground"):
         describe_scene(hilly, CAMERA, *pose(40.0), SUN)
     with raises(TerrainError):
@@ -249,18 +237,12 @@ def planes_of(scene, cosine, direct, range_km):
     return planes
 
 
-def test_passes_become_radiance_share_of_the_sun_and_range(scene):
+def test_passes_become_radiance_share_of_the_sun_and_range_and_a_missing_one_is_named(scene):
     picture = cycles.rendering_of_passes(planes_of(scene, 0.4, 0.2, 24.0), scene)
     assert picture.radiance[1, 1] == approx(0.03) and picture.radiance[0, 0] == 0.0
     assert picture.lit[1, 1] == approx(0.5, abs=1e-6) and picture.lit[0, 0] == 0.0
     assert picture.range_m[1, 1] == approx(24e3, rel=1e-6) and isnan(picture.range_m[0, 0])
-
-
-def test_ground_turned_from_the_sun_is_in_shadow(scene):
     assert cycles.rendering_of_passes(planes_of(scene, -0.2, 0.0, 24.0), scene).lit.max() == 0.0
-
-
-def test_a_missing_pass_is_named(scene):
     planes = planes_of(scene, 0.4, 0.2, 24.0)
     del planes["V.Position.Y"]
     with raises(RendererError, match=r"expected a pass Position\.Y, found V\.Combined"):

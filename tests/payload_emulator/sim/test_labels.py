@@ -1,19 +1,23 @@
-"""The EXR reader against files written after the format's description, field by field."""
+"""Labels against rims found by casting rays; the EXR reader against files written field by field."""
 
-from math import cos, degrees, isnan, pi, radians, sin, sqrt
+from math import cos, degrees, hypot, isnan, pi, radians, sin, sqrt
 
 import numpy as np
 from pytest import approx, mark, raises
 
-from lunar.camera import PinholeCamera, nadir_camera_from_mcmf
+from lunar.camera import BrownCamera, PinholeCamera, nadir_camera_from_mcmf, pointed_camera_from_mcmf
 from lunar.catalogue import make_catalogue
 from lunar.constants import MOON_RADIUS_M
+from lunar.datafolder import find_data
 from lunar.frames import axis_rotation, mcmf_from_spherical
 from payload_emulator.errors import RendererError
 from payload_emulator.sim.render import raymarch
 from payload_emulator.sim.render.cycles import read_exr
 from payload_emulator.sim.render.labels import label_frame, project_craters
 from payload_emulator.sim.render.light import sun_direction_mcmf
+from payload_emulator.sim.render.raymarch import cast
+from payload_emulator.sim.terrain.opening import open_terrain
+from tests.payload_emulator.sim.cast_rims import rim_errors
 from tests.payload_emulator.sim.exr_file import exr_octets
 
 CAMERA = PinholeCamera()
@@ -32,7 +36,7 @@ def crater_at(latitude_deg, longitude_deg, diameter_m, rim_height_m):
     )  # fmt: skip
 
 
-def test_a_crater_below_the_camera_is_in_the_middle_and_as_wide_as_the_lens_makes_it():
+def test_a_crater_below_is_as_wide_as_the_lens_makes_it_and_rim_height_moves_one_at_the_edge():
     catalogue = crater_at(degrees(0.2), degrees(1.0), 5000.0, 2000.0)
     labels = project_craters(catalogue, CAMERA, *pose(0.2, 1.0))
     assert (labels.u_px[0], labels.v_px[0]) == approx((255.5, 255.5), abs=1e-6)
@@ -40,9 +44,6 @@ def test_a_crater_below_the_camera_is_in_the_middle_and_as_wide_as_the_lens_make
     width = 5000.0 * (1.0 + 2000.0 / MOON_RADIUS_M)
     assert labels.diameter_px[0] == approx(CAMERA.focal_px * width / 18_001.8, rel=1e-5)
     assert labels.size_class[0] == 0 and labels.inside[0] and labels.visible_fraction[0] == 1.0
-
-
-def test_rim_height_moves_a_crater_at_the_edge():
     longitude = degrees(1.0 + 30e3 / MOON_RADIUS_M)
     low, high = (
         project_craters(crater_at(0.0, longitude, 5000.0, height), CAMERA, *pose(0.0, 1.0)).u_px[0]
@@ -99,19 +100,13 @@ def project_rim_middle(catalogue, position, rotation):
     return np.average(labels.u_px, weights=weight), np.average(labels.v_px, weights=weight)
 
 
-def test_what_is_cut_by_the_edge_says_so():
+def test_craters_cut_by_the_edge_say_so_and_those_out_of_sight_or_behind_the_limb_are_none():
     longitude = degrees(34.2e3 / MOON_RADIUS_M)
     labels = project_craters(crater_at(0.0, longitude, 9000.0, 0.0), CAMERA, *pose())
     assert 0.3 < labels.visible_fraction[0] < 0.7
-
-
-def test_no_crater_in_sight_gives_empty_labels():
     assert len(project_craters(crater_at(40.0, 100.0, 9000.0, 0.0), CAMERA, *pose())) == 0
     empty = make_catalogue([], [], [], source="t")
     assert len(project_craters(empty, CAMERA, *pose())) == 0
-
-
-def test_a_crater_behind_the_limb_is_no_label():
     far = crater_at(0.0, 179.0, 9000.0, 0.0)
     assert len(project_craters(far, CAMERA, *pose())) == 0
 
@@ -178,3 +173,59 @@ def test_anything_else_is_refused_with_what_is_wrong(tmp_path, octets, message):
     file.write_bytes(octets)
     with raises(RendererError, match=message):
         read_exr(file)
+
+
+def errors_px(terrain, latitude_deg, longitude_deg, altitudes_m, camera=CAMERA):
+    offsets = []
+    for number, altitude_m in enumerate(altitudes_m):
+        place = radians(latitude_deg), radians(longitude_deg)
+        position = mcmf_from_spherical(*place, altitude_m)
+        rotation = pointed_camera_from_mcmf(position, radians(2.0 * number), 0.7 * number)
+        index, found = rim_errors(terrain, camera, position, rotation)
+        offsets += [*found[terrain.catalogue.diameter_m[index] <= 30e3].ravel()]
+    return np.array(offsets)
+
+
+def test_rays_meet_a_smooth_sphere_where_geometry_says(formula_terrain):
+    terrain = formula_terrain(lambda latitude, longitude: 700.0 + 0.0 * latitude)
+    position = mcmf_from_spherical(0.2, 1.0, 25e3)
+    rotation = nadir_camera_from_mcmf(position)
+    uv = np.array([[255.5, 255.5], [400.25, 30.5], [0.0, 511.0]])
+    hits = cast(terrain, CAMERA, position, rotation, uv)
+    # Heights are single precision and a ray is halved onto the ground to millimetres.
+    np.testing.assert_allclose(np.linalg.norm(hits, axis=1) - MOON_RADIUS_M, 700.0, atol=0.05)
+    np.testing.assert_allclose(CAMERA.project((hits - position) @ rotation.T), uv, atol=1e-3)
+
+
+def test_a_label_on_a_slope_sits_on_the_slopes_rim(formula_terrain):
+    """A rim 300 m higher in the north, seen from the side: a label of one height is off by more than 0.1 px."""
+    latitude, longitude = 0.2 + 30e3 / MOON_RADIUS_M, 1.0
+    catalogue = make_catalogue([latitude], [longitude], [14_000.0], source="t")
+    slope = 300.0 / (7_000.0 / MOON_RADIUS_M)
+    terrain = formula_terrain(lambda lat, lon: slope * (lat - latitude) + 0.0 * lon, catalogue)
+    position = mcmf_from_spherical(0.2, 1.0, 25e3)
+    index, offsets = rim_errors(terrain, CAMERA, position, nadir_camera_from_mcmf(position))
+    assert index.tolist() == [0] and hypot(*offsets[0]) < 0.01
+    level = project_craters(terrain.measured(np.array([0])), CAMERA, position, nadir_camera_from_mcmf(position))
+    tilted = label_frame(terrain, CAMERA, position, nadir_camera_from_mcmf(position))
+    assert hypot(level.u_px[0] - tilted.u_px[0], level.v_px[0] - tilted.v_px[0]) > 0.1
+    tilt = terrain.rim_tilts_m(np.array([0]))[0]
+    # 300 m over one radius to the north, by the definition of the slope.
+    assert tilt[0] == approx(300.0, rel=0.01) and abs(tilt[1]) < 1.0
+
+
+def test_labels_sit_on_procedural_rims_also_through_a_distorting_lens(procedural):
+    offsets = errors_px(procedural, 10.0, 20.0, (22e3, 45e3))
+    assert offsets.size >= 40
+    assert sqrt(np.mean(offsets**2)) <= 0.1
+    offsets = errors_px(procedural, 10.0, 20.0, (40e3,), BrownCamera(k1=-0.015, p1=5e-4))
+    assert offsets.size >= 20
+    assert sqrt(np.mean(offsets**2)) <= 0.1
+
+
+@mark.real_data
+def test_labels_sit_on_real_rims(data_path):
+    terrain = open_terrain("raster", find_data(data_path), 3)
+    offsets = errors_px(terrain, -30.0, 294.0, (45e3,))
+    assert offsets.size >= 20
+    assert sqrt(np.mean(offsets**2)) <= 0.1

@@ -49,15 +49,12 @@ def test_heights_depend_neither_on_what_was_asked_before_nor_on_the_tiles_that_a
     assert len(second._small._cells) == 3
 
 
-def test_there_is_no_step_at_the_prime_meridian(procedural):
+def test_there_is_no_step_at_the_prime_meridian_and_other_seeds_are_other_worlds(procedural):
     latitude = np.radians(np.linspace(9.0, 11.0, 200))
     step = math.radians(0.5 / 256.0)
     across = procedural.height_m(latitude, 2.0 * math.pi - step) - procedural.height_m(latitude, step)
     nearby = procedural.height_m(latitude, step) - procedural.height_m(latitude, 3.0 * step)
     assert np.sqrt(np.mean(across**2)) < 2.0 * np.sqrt(np.mean(nearby**2)) + 1.0
-
-
-def test_worlds_of_other_seeds_are_other_worlds(procedural):
     other = ProceduralTerrain(4)
     latitude, longitude = np.radians([10.0, 11.0]), np.radians([20.0, 21.0])
     assert np.abs(procedural.height_m(latitude, longitude) - other.height_m(latitude, longitude)).min() > 0.1

@@ -1,6 +1,4 @@
-"""Observation times and pointing of the spacecraft, on an orbit simple enough to check by hand. Power, heat and
-processor time of the simulated board; faults as text.
-"""
+"""Observation times and pointing on an orbit that is checked by hand; the simulated board and its faults."""
 
 from concurrent.futures import ThreadPoolExecutor
 
@@ -94,7 +92,7 @@ def test_a_window_runs_across_the_band_in_the_wanted_direction(polar_truth, dire
     assert np.degrees(longitude) % 360.0 == approx(longitude_deg, abs=1e-6)
 
 
-def test_a_window_whose_swath_leaves_the_terrain_is_not_taken(polar_truth):
+def test_a_window_whose_swath_leaves_the_terrain_is_not_taken_and_tells_the_latitudes(polar_truth):
     # At 30 km the swath reaches 30 km x tan 60 deg = 52 km, 1.7 degrees at the equator and 3.4 at 60 degrees.
     def narrow(latitude, longitude):
         return np.abs(np.degrees(longitude)) < 2.5
@@ -105,8 +103,6 @@ def test_a_window_whose_swath_leaves_the_terrain_is_not_taken(polar_truth):
     assert not any(one.observable for one in crossings(polar_truth, narrow))
     assert crossings(polar_truth, wide)[0].observable
 
-
-def test_a_crossing_tells_the_latitudes_without_terrain(polar_truth):
     def north_of_ten_degrees_without_a_hole(latitude, longitude):
         degrees = np.degrees(latitude)
         return (degrees > 10.0) & ~((degrees > 30.0) & (degrees < 40.0))
@@ -117,12 +113,9 @@ def test_a_crossing_tells_the_latitudes_without_terrain(polar_truth):
     assert_allclose(np.degrees(found.missing_rad), [[-60.0, 10.0], [30.0, 40.0]], atol=1.2)
 
 
-def test_a_crossing_outside_the_wanted_longitudes_is_not_observable(polar_truth):
+def test_crossings_outside_the_longitudes_are_not_observable_and_bands_lie_on_one_side(polar_truth):
     found = crossings(polar_truth, everywhere, lambda longitude: np.degrees(longitude) > 1.0)[0]
     assert not found.in_reach and not found.observable and found.missing_rad.size == 0
-
-
-def test_the_band_may_lie_on_one_side_of_the_equator(polar_truth):
     band_rad = (np.radians(20.0), np.radians(50.0))
     _, latitude = latitudes(polar_truth, band_rad)
     assert latitude.min() >= band_rad[0] and latitude.max() <= band_rad[1]
@@ -132,16 +125,13 @@ def test_the_band_may_lie_on_one_side_of_the_equator(polar_truth):
     assert (found.stop_utc_ns - found.start_utc_ns) / NS == approx(PERIOD_S / 12.0, abs=61.0)
 
 
-def test_the_attitude_message_carries_attitude_and_sun():
+def test_the_attitude_message_carries_attitude_and_sun_and_an_error_turns_the_camera_by_its_size():
     camera_from_mcmf = nadir_camera_from_mcmf(np.array([RADIUS_M, 0.0, 0.0]))
     sun_mcmf = np.array([0.6, 0.0, 0.8])
     message = attitude_message(camera_from_mcmf, camera_from_mcmf @ sun_mcmf)
     assert_allclose(matrix_from_quaternion(message[:4]), camera_from_mcmf, atol=1e-12)
     # Camera: x east, y south, z down. The Sun stands 0.6 up and 0.8 north.
     assert_allclose(message[4:], [0.0, -0.8, -0.6], atol=1e-12)
-
-
-def test_a_pointing_error_turns_the_camera_by_its_size():
     camera = nadir_camera_from_mcmf(np.array([RADIUS_M, 0.0, 0.0]))
     turned = perturbed(camera, np.array([0.0, np.radians(2.0), 0.0]))
     angle = np.arccos((np.trace(turned @ camera.T) - 1.0) / 2.0)
@@ -204,7 +194,7 @@ def test_the_sensors_and_stages_are_those_that_flight_reads():
     assert all(hasattr(simulated, name) for name in [*members, "reset_cause", "store", "settings"])
 
 
-def test_energy_is_kept_between_arrays_loads_and_battery():
+def test_energy_is_kept_between_arrays_loads_and_battery_and_the_bus_obeys_ohms_law():
     simulated = board(charge=0.5)
     run(simulated, 60, 0.0)
     # An hour of 2.2 + 1.6 + 3.4 W out of 20 Wh, by hand.
@@ -212,9 +202,6 @@ def test_energy_is_kept_between_arrays_loads_and_battery():
     run(simulated, 60)
 
     assert simulated.charge == approx(0.5 - 7.2 / 20.0 + (9.0 - 7.2) / 20.0, abs=1e-9)
-
-
-def test_the_bus_obeys_ohms_law():
     simulated = board(charge=1.0)
     volts, amperes, _, _ = np.mean([simulated.sensors() for _ in range(400)], axis=0)
     # 12.6 V behind 0.15 ohm, 2.2 W drawn: V = 12.6 - 0.15 I, V I = 2.2; noise of 5 mV over 400 readings.

@@ -1,8 +1,4 @@
-"""Data sets on disk: what is written can be read, checked and refused. A crop shows its craters where it says
-they are. Targets and what the flight decoder makes of a network with exactly given output.
-Recipes: what is refused, and that splits cannot touch. An exported network made trainable again: the same
-outputs, and a normalisation that fits the data.
-"""
+"""Data sets on disk: recipes, crops, targets; an exported network made trainable again."""
 
 import json
 import shutil
@@ -215,7 +211,7 @@ def test_nothing_is_left_of_a_crater_outside_of_the_image():
     assert clipped(ellipse_polygon(-20.0, 5.0, 10.0, 5.0, 0.3), 200, 80).shape == (0, 2)
 
 
-def test_coco_boxes_surround_their_centres(blob_dataset):
+def test_boxes_surround_their_centres_and_the_ground_diameter_undoes_the_projection(blob_dataset):
     coco = json.loads((blob_dataset.folder / "coco_train.json").read_text())
     whole = [a for a in coco["annotations"] if min(a["bbox"][:2]) > 0.0 and max(far_corner(a)) < 512.0]
     assert len(whole) > 100
@@ -224,9 +220,6 @@ def test_coco_boxes_surround_their_centres(blob_dataset):
         # COCO counts from the corner of the first pixel, labels from its centre; both are rounded to 0.01 px.
         assert x + w / 2 == pytest.approx(a["centre"][0] + 0.5, abs=0.02)
         assert y + h / 2 == pytest.approx(a["centre"][1] + 0.5, abs=0.02)
-
-
-def test_the_ground_diameter_undoes_the_projection(blob_dataset):
     frame = blob_dataset.frames("test")[0]
     c = frame.craters
     ground = store.diameter_on_ground_m(blob_dataset, frame, c["u_px"], c["v_px"], c["diameter_px"])
@@ -323,7 +316,7 @@ def test_a_spot_lands_where_the_label_says(sun, seed):
         assert (rows * weight).sum() / weight.sum() == pytest.approx(y, abs=0.5)
 
 
-def test_the_sun_is_at_the_top_of_every_crop():
+def test_the_sun_is_at_the_top_of_every_crop_and_one_seed_gives_one_crop():
     row, _ = np.mgrid[0:512, 0:512]
     bright_right = np.rot90((255 * (1 - row / 511)).astype(np.uint8), 3).copy()
     assert bright_right[:, -1].mean() > bright_right[:, 0].mean()
@@ -332,9 +325,6 @@ def test_the_sun_is_at_the_top_of_every_crop():
         QUIET, np.random.default_rng(3),
     )  # fmt: skip
     assert crop.image[:40].mean() > crop.image[-40:].mean() + 0.5
-
-
-def test_one_seed_gives_one_crop():
     image = spot_image([100, 300], [100, 300])
     arguments = (
         image, np.array([0.0, -1.0, 0.0]), np.array([100.0]), np.array([100.0]), np.array([20.0]), np.array([True]),
@@ -371,30 +361,21 @@ def test_decoding_the_targets_returns_the_craters():
     assert found.diameter_px[order] == pytest.approx(diameter, rel=1e-4)
 
 
-def test_an_ignored_crater_takes_the_loss_away_around_it_and_adds_no_heat():
+def test_an_ignored_crater_takes_only_its_own_loss_away_and_class_maps_follow_the_common_one():
     t = targets([200], [100], [60], Tier.IGNORE)
     assert t.heat.max() == 0.0 and t.weight.max() == 0.0 and t.regressed.max() == 0.0
     assert t.negative[0, 25, 50] == 0.0
     assert t.negative[0, 25, 80] == 1.0
-
-
-def test_a_label_next_to_an_ignored_crater_keeps_its_own_weight():
     t = targets([200, 206], [100, 100], [60, 40], [Tier.IGNORE, Tier.LABEL], [1.0, 0.7])
     assert t.weight.max() == pytest.approx(0.7)
-
-
-def test_class_heatmaps_follow_the_common_one():
     t = targets([100, 300], [100, 300], [40, 60], Tier.LABEL, 1.0, np.array([0, 3], np.int8))
     assert [one.max() for one in t.heat[1:]] == [1.0, 0.0, 0.0]
     assert (t.heat[0] == 1.0).sum() == 2
 
 
-def test_no_craters_give_a_plain_background():
+def test_heat_falls_with_distance_in_units_of_the_radius_and_no_craters_give_none():
     t, _ = perfect_maps([], [], [])
     assert t.heat.max() == 0.0 and t.negative.min() == 1.0
-
-
-def test_heat_falls_with_distance_in_units_of_the_radius():
     t, _ = perfect_maps([257.5], [257.5], [80.0])
     # sigma = 0.22 R = 2.2 cells: one sigma away exp(-1/2).
     assert t.heat[0, 64, 64] == 1.0
@@ -459,16 +440,13 @@ def test_the_shipped_recipe_keeps_every_test_and_validation_box_away_from_traini
                 assert seeds.setdefault(seed, source.split) == source.split
 
 
-def test_a_footprint_within_the_buffer_of_a_forbidden_box_is_refused():
+def test_a_footprint_near_a_forbidden_box_is_refused_also_over_the_zero_meridian():
     source = Source("x", "train", "real", 1.0, avoid=(Box(285.0, 300.0, -60.0, 60.0),), buffer_km=60.0)
     world = Box(180.0, 330.0, -60.0, 60.0)
     # One degree of longitude is 30.3 km at the equator and half of that at 60 degrees.
     places = ((0.0, 284.0), (0.0, 283.1), (0.0, 282.9), (58.0, 281.5))
     found = [bool(allowed(source, world, np.array([north]), np.array([east]))) for north, east in places]
     assert found == [False, False, True, False]
-
-
-def test_boxes_join_over_the_zero_meridian():
     box = Box(350.0, 370.0, -10.0, 10.0)
     inside = inside_box(box, np.zeros(4), np.array([355.0, 5.0, 12.0, 349.0]), 0.0)
     assert inside.tolist() == [True, True, False, False]

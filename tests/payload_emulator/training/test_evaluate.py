@@ -1,19 +1,16 @@
-"""Evaluation from data set to figures and report: what is refused, what every answer holds. What is exported is
-what was trained: parity, origin, the paper's variant, eight bits. Learned craters as labels of a training:
-where they are in view, and how their file is read. Signed bias by the Sun's azimuth, in the axes of the image
-and of the Sun; distances from measured rims. The parallax of crater walls is found where it was put in, and
-taken out by the flight code. Figures by altitude, light, place and state, against scenes whose answer is
-known.
-"""
+"""Evaluation, export and calibration of detectors: what is refused, and figures of scenes with known answers."""
 
 import json
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from payload_emulator.errors import DatasetError, ModelError
 from payload_emulator.flight.models import load_shipped_model
+from payload_emulator.flight.vision.calibration import CALIBRATION_KEY
 from payload_emulator.flight.vision.detector import OnnxDetector
 from payload_emulator.training.data.feeder import TrainParameters
 from payload_emulator.training.data.landmarks import load_landmarks, with_landmarks
@@ -28,9 +25,28 @@ from payload_emulator.training.evaluate.evaluate import (
 )
 from payload_emulator.training.evaluate.metrics import Scene, Thresholds, bias_by_octant, bias_overall, score
 from payload_emulator.training.evaluate.report import detector_report
-from payload_emulator.training.evaluate.scoring import average_precision, tally
+from payload_emulator.training.evaluate.scoring import (
+    MatchRule,
+    average_precision,
+    best_threshold,
+    match,
+    tally,
+    threshold_for_precision,
+    with_interval,
+)
 from payload_emulator.training.model.calibrate import fit_parallax, paper_threshold, without_parallax
 from payload_emulator.training.model.export import PARITY_LIMIT, export
+from payload_emulator.training.model.fit_calibration import (
+    FRESH_FACTOR,
+    Pairs,
+    fit_calibration,
+    fit_score,
+    fit_sigma,
+    fit_sun,
+    format_calibration_figures,
+    plain_model,
+    sun_directions,
+)
 from payload_emulator.training.model.train import train
 from reports.json_form import to_json
 from reports.render import render_html
@@ -369,3 +385,227 @@ def test_average_precision_of_a_ranking_done_by_hand():
     truth, _ = scene([100, 200], [100, 200])
     found = found_at([100, 400, 200], [100, 400, 200], scores=[0.9, 0.8, 0.7])
     assert average_precision(tally([truth], [found])) == pytest.approx(0.5 + 0.5 * 2 / 3)
+
+
+def truth(u, v, depth_ratio=0.15, **more):
+    return truth_of(u, v, ratio=depth_ratio, **more)
+
+
+def found(u, v, score, diameter_m=7e3):
+    return found_at(u, v, 30.0, diameter_m, score)
+
+
+def test_two_detections_of_one_crater_are_one_right_and_one_false():
+    figures = tally([truth([100], [100])], [found([101, 103], [100, 100], [0.9, 0.8])]).figures(0.1)
+    assert (figures.detected_true, figures.false_alarms, figures.expected) == (1, 1, 1)
+
+
+def test_the_better_detection_takes_the_crater():
+    tallied = tally([truth([100], [100])], [found([105, 100], [100, 100], [0.9, 0.8])])
+    assert tallied.figures(0.85).detected_true == 1
+    assert tallied.error_u[tallied.outcome == 1] == pytest.approx([5.0])
+
+
+def test_precision_recall_and_f1_of_a_case_counted_by_hand():
+    # 4 craters, 3 detections of which 2 are right: P 2/3, R 1/2, F1 = 2*2/(3+4).
+    figures = tally(
+        [truth([50, 150, 250, 350], [50, 50, 50, 50])], [found([52, 150, 450], [50, 53, 450], [0.9, 0.8, 0.7])]
+    ).figures(0.5)
+    assert figures.precision == pytest.approx(2 / 3)
+    assert figures.recall == pytest.approx(0.5)
+    assert figures.f1 == pytest.approx(4 / 7)
+    assert figures.loc_px == pytest.approx(2.5)
+
+
+def test_the_pixel_rule_ends_at_ten_pixels_and_the_radius_rule_at_half_a_radius():
+    frame = truth([100], [100])
+    for u, right, rule in ((110, 1, {}), (110.1, 0, {}), (107.4, 1, {"radii": 0.5}), (107.6, 0, {"radii": 0.5})):
+        tallied = tally([frame], [found([u], [100], [0.9])], rule=MatchRule(**rule))
+        assert tallied.figures(0.5).detected_true == right
+
+
+def test_a_ghost_counts_when_strict_and_is_left_out_when_ignore_aware():
+    frame = truth([100, 300], [100, 300], depth_ratio=[0.15, 0.01])
+    detections = found([100, 300], [100, 300], [0.9, 0.8])
+    strict = tally([frame], [detections]).figures(0.5)
+    fair = tally([frame], [detections], ignore_aware=True).figures(0.5)
+    assert (strict.expected, strict.detected_true, strict.false_alarms) == (2, 2, 0)
+    assert (fair.expected, fair.detected_true, fair.false_alarms) == (1, 1, 0)
+
+
+def test_a_detection_on_nothing_is_false_by_both_rules():
+    frame = truth([100], [100])
+    detections = found([100, 300], [100, 300], [0.9, 0.8])
+    for aware in (False, True):
+        assert tally([frame], [detections], ignore_aware=aware).figures(0.5).false_alarms == 1
+
+
+def test_a_detection_of_the_wrong_class_is_false_and_its_crater_missed():
+    frame = truth([100], [100], diameter_m=9_500.0)
+    detections = found([100], [100], [0.9], diameter_m=10_500.0)
+    assert tally([frame], [detections], classes=(0,)).figures(0.5).recall == 0.0
+    assert tally([frame], [detections], classes=(1,)).figures(0.5).precision == 0.0
+    assert tally([frame], [detections]).figures(0.5).f1 == 1.0
+
+
+def test_nothing_expected_and_nothing_found_gives_no_figure_instead_of_a_perfect_one():
+    figures = tally([truth([], [])], [found([], [], [])]).figures(0.5)
+    assert np.isnan([figures.precision, figures.recall, figures.f1, figures.loc_px]).all()
+
+
+def test_the_best_threshold_separates_right_from_wrong():
+    frames = [truth([100, 200], [100, 200])] * 5
+    detections = [found([100, 200, 300], [100, 200, 300], [0.8, 0.7, 0.3])] * 5
+    threshold, figures = best_threshold(tally(frames, detections))
+    assert 0.3 < threshold <= 0.7
+    assert figures.f1 == 1.0
+
+
+def test_the_bootstrap_interval_holds_the_figure_and_narrows_to_it_when_blocks_agree():
+    frames = [truth([100, 200], [100, 200], number=k) for k in range(8)]
+    detections = [found([100], [100], [0.9])] * 8
+    assert with_interval(tally(frames, detections), 0.5)["f1_interval_95"] == pytest.approx([2 / 3, 2 / 3])
+
+
+points = st.lists(st.tuples(st.floats(0, 100), st.floats(0, 100)), max_size=12)
+
+
+@settings(max_examples=60, deadline=None)
+@given(points, points)
+def test_a_match_is_one_to_one_and_within_reach(detections, craters):
+    du, dv = (np.array([p[k] for p in detections]) for k in (0, 1))
+    cu, cv = (np.array([p[k] for p in craters]) for k in (0, 1))
+    taken = match(du, dv, cu, cv, np.full(len(craters), 20.0), MatchRule())
+    used = taken[taken >= 0]
+    assert len(set(used.tolist())) == used.size
+    for i, k in enumerate(taken):
+        if k >= 0:
+            assert np.hypot(du[i] - cu[k], dv[i] - cv[k]) <= 10.0
+
+
+def test_a_precision_that_rests_on_a_handful_of_detections_decides_nothing():
+    # The two best detections are false, the next 298 are right: from 100 detections on the precision is 0.98 and over.
+    n = 300
+    place = np.linspace(5.0, 505.0, 20)
+    u, v = (part.ravel()[:n] for part in np.meshgrid(place, place))
+    score = np.linspace(0.94, 0.30, n)
+    craters = truth(u[2:], v[2:], diameter=10.0)
+    tallied = tally([craters], [found(u, v, score)], rule=MatchRule(pixels=3.0))
+    assert tallied.figures(0.93).precision < 0.9
+    assert threshold_for_precision(tallied, 0.9) < 0.31
+
+
+def scored_frames(count=150, seed=1):
+    """Detections far from each other; right with the odds of exp(2 logit(score) + 1 - ln(diameter / 20))."""
+    rng = np.random.default_rng(seed)
+    truths, found = [], []
+    u, v = (part.ravel() for part in np.meshgrid(np.arange(40.0, 500.0, 60.0), np.arange(40.0, 500.0, 60.0)))
+    for _ in range(count):
+        diameter = np.exp(rng.uniform(np.log(10.0), np.log(80.0), u.size))
+        score = np.sort(rng.uniform(0.1, 0.9, u.size))[::-1]
+        odds = np.exp(2.0 * np.log(score / (1.0 - score)) + 1.0 - np.log(diameter / 20.0))
+        right = rng.uniform(size=u.size) < odds / (1.0 + odds)
+        found.append(found_at(u, v, diameter, 8e3, score))
+        truths.append(truth_of(u[right], v[right], diameter[right], diameter_m=8e3))
+    return truths, found
+
+
+def test_the_odds_put_in_are_the_odds_found():
+    model = fit_score(*scored_frames())
+    assert model.slope == pytest.approx(2.0, rel=0.1)
+    offset = np.interp(np.log([14.0, 20.0, 40.0]), model.log_diameter_px, model.offset)
+    # Some 10,000 detections: the standard error of an offset is about 0.08.
+    assert offset == pytest.approx(1.0 - np.log(np.array([14.0, 20.0, 40.0]) / 20.0), abs=0.3)
+    half = model.probability(np.array([0.5]), np.array([20.0]))[0]
+    assert half == pytest.approx(np.e / (1.0 + np.e), abs=0.05)
+
+
+def test_too_few_detections_are_refused():
+    with pytest.raises(DatasetError, match="expected at least 200 detections"):
+        fit_score(*scored_frames(2))
+
+
+def pairs(pull=(0.3, 0.2, 0.4), ground_m=((60.0, -30.0), (-20.0, 10.0)), lasting=1.2, fresh=0.4, seed=2):
+    """Craters seen four times under one Sun, with a pull, a registration of two cells, and an error in two parts."""
+    rng = np.random.default_rng(seed)
+    error, directions, scale, place, crater, size = [], [], [], [], [], []
+    for number in range(3_000):
+        azimuth = rng.uniform(-np.pi, np.pi)
+        sun = np.array([np.sin(azimuth), -np.cos(azimuth), -0.2])
+        diameter = float(np.exp(rng.uniform(np.log(10.0), np.log(60.0))))
+        cell, m_per_px = number % 2, rng.uniform(100.0, 300.0)
+        own = lasting * diameter / 20.0 * rng.standard_normal(2)
+        toward = sun_directions(np.array([diameter]), sun)[0]
+        east, north = ground_m[cell]
+        for _ in range(4):
+            moved = toward @ np.array(pull) + np.array([east, -north]) / m_per_px
+            error.append(moved + own + fresh * rng.standard_normal(2))
+            directions.append(toward)
+            scale.append(m_per_px)
+            place.append(cell)
+            crater.append(number)
+            size.append(np.log(diameter / 20.0))
+    count = len(error)
+    one = np.ones(count)
+    features = np.stack([one, np.array(size), np.log(1.5) * one, one, 1.7 * one, rng.uniform(0, 1.4, count)], axis=1)
+    return Pairs(np.array(error), features, np.array(directions), np.array(scale), np.array(place), np.array(crater))
+
+
+def test_pull_and_registration_are_separated():
+    residual, evidence = fit_sun(pairs())
+    assert tuple(evidence["coefficients_px"]) == pytest.approx((0.3, 0.2, 0.4), abs=0.08)
+    assert max(evidence["standard_errors_px"]) < 0.05
+    for row, (east, north) in zip(evidence["registration"], ((60.0, -30.0), (-20.0, 10.0)), strict=True):
+        assert row["east_m"] == pytest.approx(east, abs=8.0)
+        assert row["north_m"] == pytest.approx(north, abs=8.0)
+        assert row["standard_error_m"] < 6.0
+    assert np.abs(residual.mean(axis=0)).max() < 0.05
+
+
+def test_lasting_and_fresh_errors_are_separated():
+    from dataclasses import replace
+
+    every = pairs()
+    residual, _ = fit_sun(every)
+    model, evidence = fit_sigma(replace(every, error_px=residual))
+    for size in (-0.5, 0.0, 0.8):
+        total, fresh = model.variances_px2(np.array([[1.0, size, np.log(1.5), 1.0, 1.7, 0.5]]))
+        lasting = 1.2 * np.exp(size)
+        assert np.sqrt(fresh[0]) == pytest.approx(FRESH_FACTOR * 0.4, rel=0.1)
+        assert np.sqrt(total[0]) == pytest.approx(np.hypot(0.4, lasting), rel=0.15)
+    assert evidence["mean_square_over_variance"] == pytest.approx(1.0, abs=0.05)
+
+
+def test_craters_seen_once_do_not_tell_what_lasts():
+    every = pairs()
+    once = every.select(np.arange(every.place.size) % 4 == 0)
+    with pytest.raises(DatasetError, match="several frames under one Sun"):
+        fit_sigma(once)
+
+
+def test_a_data_set_without_validation_frames_is_refused(make_blob_dataset, tmp_path):
+    only_test = make_blob_dataset(tmp_path / "set", {"test": 1})
+    with pytest.raises(DatasetError, match="expected frames of split 'val'"):
+        fit_calibration(load_shipped_model(), [only_test])
+
+
+def test_a_calibrated_model_gives_back_the_plain_one():
+    octets = load_shipped_model()
+    plain = plain_model(octets)
+    metadata = OnnxDetector(plain).metadata
+    assert CALIBRATION_KEY not in metadata and metadata["score_threshold"] == "0.44"
+    assert plain_model(plain) == plain
+
+
+def test_the_same_frames_give_the_same_file(blob_dataset, monkeypatch):
+    from payload_emulator.training.model import fit_calibration as module
+
+    monkeypatch.setattr(module, "_pairs", lambda *_: pairs())
+    monkeypatch.setattr(module, "_LEAST_ROWS", 10)
+    first, document = fit_calibration(load_shipped_model(), [blob_dataset])
+    again, _ = fit_calibration(first, [blob_dataset])
+    assert again == first
+    assert OnnxDetector(first).calibration.fresh == tuple(document["sigma"]["fresh"])
+    assert plain_model(first) == plain_model(load_shipped_model())
+    text = format_calibration_figures(document)
+    assert "pull of the Sun" in text and "lasting share" in text and "registration" in text

@@ -192,7 +192,6 @@ def test_a_run_killed_and_resumed_reaches_the_figures_of_one_left_alone(blob_dat
         [sys.executable, "-c", code, str(blob_dataset.folder), str(tmp_path / "killed")], stdout=subprocess.PIPE,
         env={**os.environ, "PYTHONPATH": os.getcwd()}, text=True,
     )  # fmt: skip
-    assert process.stdout is not None
     while (line := process.stdout.readline()).strip() != "checkpoint.pt":
         assert line, "the run ended before it wrote a checkpoint"
     process.send_signal(signal.SIGKILL)

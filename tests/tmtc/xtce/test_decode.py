@@ -257,15 +257,12 @@ def test_a_text_may_end_with_a_character_and_what_follows_begins_there():
     assert values(last, [b"abc"])["A"] == ["abc"]  # the text fills what is left
 
 
-def test_a_text_without_terminator_fills_its_field_and_one_that_is_no_text_is_unknown():
+def test_a_text_without_terminator_fills_its_field_and_one_of_two_octets_stands_at_a_character():
     types = text_type(fixed_size(24, "<TerminationChar/>")) + integer("N", 8)
     text = layout(types, A="T", B="N")
     packets = [b"ab\0\x07", b"abc\x07", b"\xc3\x28\0\x07"]
     assert values(text, packets) == {"A": ["ab", "abc", None], "B": [7] * 3}
     assert decoded(text, packets).values_unknown() == {"A": 1}
-
-
-def test_a_terminator_of_two_octets_stands_at_a_whole_character():
     size = fixed_size(64, "<TerminationChar>0000</TerminationChar>")
     data = "aĀ".encode("utf-16-be") + b"\0\0\0x"  # 00 61 01 00 00 00: the first two zeros are of two characters
     assert one(data, text_type(size, "UTF-16BE"), A="T")["A"] == ["aĀ"]
@@ -282,13 +279,10 @@ def test_zeros_at_the_end_of_a_text_belong_to_it(charset):
     assert values(text, packets)["A"] == expected
 
 
-def test_texts_and_octets_that_begin_inside_an_octet_are_read():
+def test_texts_that_begin_inside_an_octet_are_read_and_a_size_may_be_looked_up():
     types = integer("N", 3) + text_type(fixed_size(16)) + binary(13)
     found = one(Bits().add(5, 3).octets(b"hi").add(0x1ABC, 13).packed(), types, N="N", T="T", B="B")
     assert found == {"N": [5], "T": ["hi"], "B": [b"\x1a\xbc"]}
-
-
-def test_a_size_may_be_looked_up():
     lookup = "".join(
         f'<DiscreteLookup value="{bits}">{comparison("N", n)}</DiscreteLookup>' for n, bits in ((1, 8), (2, 24))
     )
@@ -378,16 +372,13 @@ def test_elements_that_say_their_own_length_are_read_one_after_another():
     assert columns["z"].to_list() == [0x63] * 4 and found.verdict.tolist() == [0, 0, 0, 0, 3]
 
 
-def test_arrays_in_arrays_of_which_there_are_none_are_empty():
+def test_arrays_without_elements_are_empty_also_in_arrays():
     types = integer("N", 8) + array_type("A", "N", dimension("n"))
     types += aggregate("ROW", {"k": "N", "a": "A"}) + array_type("B", "ROW", dimension("n"))
     text = layout(types, n="N", b="B")
     assert values(text, [b"\0"])["b"] == [[]]
     two = values(text, [b"\0", bytes((2, 7, 1, 2, 8, 3, 4))])["b"]
     assert two == [[], [{"k": 7, "a": [1, 2]}, {"k": 8, "a": [3, 4]}]]
-
-
-def test_no_packet_with_an_element_gives_empty_arrays():
     types = integer("N", 8) + tagged(8) + array_type("A", "T", dimension("n"))
     text = layout(types, n="N", a="A")
     assert values(text, [b"\0", b"\0"])["a"] == [[], []]
@@ -617,16 +608,13 @@ def test_first_containers_are_distinguished_by_their_conditions():
     assert [VERDICTS[v] for v in only.verdict] == ["decoded", *["no_container"] * 4, "ambiguous"]
 
 
-def test_the_first_container_is_named_where_several_have_no_conditions():
+def test_the_first_of_several_containers_is_named_and_columns_of_numbers_are_arrays():
     text = layout(integer("N", 8), container("Q", ["a"]), a="N")
     with pytest.raises(DefinitionError, match=r"BUS: expected one container without a base, found 2 \(P, Q\)"):
         decoded(text, [b"\x01"])
     with pytest.raises(DefinitionError, match="expected the name of a container"):
         decoded(text, [b"\x01"], "R")
     assert list(decoded(text, [b"\x01"], "Q").tables) == ["Q"]
-
-
-def test_columns_of_numbers_are_arrays():
     column = decoded(foreign.BUS, foreign.capture(30, 1)).tables["Housekeeping"].columns["VOLTAGE"]
     assert isinstance(column, ValueColumn)
     assert column.values.dtype == np.float64 and column.raw.dtype == np.int64
@@ -659,18 +647,23 @@ def stream_of(packets, checksum_octets=0):
     return rows, [VERDICTS[v] for v in found.verdict.tolist()]
 
 
-def test_parts_of_segmented_packets_are_joined_also_between_others_and_over_the_end_of_the_counts():
+def test_parts_of_packets_are_joined_also_over_the_end_of_the_counts_each_with_its_checksum():
     one = parts(5, 16383, b"\x00", b"\x01\x00\x00", b"\x00\x02")
     two = parts(6, 3, b"\x00\x03\x00\x00\x00", b"\x04")
     whole_one = space_packet(7, b"\x00\x05\x00\x00\x00\x06", 0)
     found, verdict = stream_of([one[0], whole_one, two[0], one[1], two[1], one[2]])
     assert found == [(0, 1, 2), (1, 5, 6), (2, 3, 4)]
     assert verdict == [*["decoded"] * 3, *["segments_joined"] * 3]
-
-
-def test_each_part_has_its_checksum():
     found, _ = stream_of(parts(5, 0, b"\x00\x01CC", b"\x00\x00CC", b"\x00\x02CC"), checksum_octets=2)
     assert found == [(0, 1, 2)]
+
+
+def test_a_part_that_was_sent_twice_is_joined_once():
+    one = parts(5, 7, b"\x00", b"\x01\x00\x00", b"\x00\x02")
+    assert stream_of([one[0], one[1], one[1], one[2]]) == ([(0, 1, 2)], ["decoded", *["segments_joined"] * 3])
+    other = one[1][:-1] + b"\x09"
+    assert stream_of([one[0], one[1], other, one[2]]) == ([], ["segments_not_joined"] * 4)
+    assert stream_of([one[0], one[1], one[1]]) == ([], ["segments_not_joined"] * 3)
 
 
 def test_parts_that_make_no_packet_are_counted_and_not_decoded():

@@ -34,7 +34,7 @@ def orbit():
     return ephemeris_from_states(every, *circular_states(every))
 
 
-def test_the_station_sees_the_spacecraft_within_contacts_only(orbit):
+def test_contacts_are_where_the_station_sees_the_spacecraft_cut_by_query_ephemeris_and_outages(orbit):
     contacts = predict_contacts(orbit, [MADRID], START, START + DAY)
     assert len(contacts) >= 2  # the orbit has a period of 111 minutes and goes behind the Moon
     for one in contacts:
@@ -43,9 +43,6 @@ def test_the_station_sees_the_spacecraft_within_contacts_only(orbit):
         for edge, step in ((one.start_utc_ns, -3 * NS), (one.stop_utc_ns, 3 * NS)):
             if START + 10 * NS < edge < START + DAY - 10 * NS:
                 assert not link(orbit, np.array([edge + step]), MADRID).visible[0]
-
-
-def test_contacts_of_a_query_are_a_cut_of_those_of_a_longer_one(orbit):
     whole = predict_contacts(orbit, [MADRID], START, START + DAY)
     edges = range(BLOCK_NS * (START // BLOCK_NS + 1), START + DAY, BLOCK_NS)
     above = predict_contacts(orbit, [ALWAYS], START, START + DAY)
@@ -54,9 +51,6 @@ def test_contacts_of_a_query_are_a_cut_of_those_of_a_longer_one(orbit):
         found = predict_contacts(orbit, [MADRID], start, stop)
         cut = [(max(one.start_utc_ns, start), min(one.stop_utc_ns, stop)) for one in whole]
         assert [(one.start_utc_ns, one.stop_utc_ns) for one in found] == [span for span in cut if span[0] < span[1]]
-
-
-def test_contacts_end_where_the_ephemeris_does_and_outages_are_left_out(orbit):
     contacts = predict_contacts(orbit, [MADRID], START - DAY, START + 5 * DAY)
     assert contacts == predict_contacts(orbit, [MADRID], START, START + DAY)
     assert predict_contacts(orbit, [MADRID], START + 2 * DAY, START + 3 * DAY) == ()
@@ -79,26 +73,17 @@ def test_without_keeps_what_no_closed_span_covers(span, closed):
         assert kept == (not any(2 * a < halves < 2 * b for a, b in closed))
 
 
-def test_a_contact_contains_its_edges_and_the_margin():
+def test_edges_of_contacts_silences_waits_and_offsets_of_the_clock_are_where_they_are_stated():
     contacts = [PredictedContact("a", 100, 200), PredictedContact("b", 300, 400)]
     assert [contact_at(contacts, t) for t in (99, 100, 200, 201)] == [None, contacts[0], contacts[0], None]
     assert contact_at(contacts, 290, 10) == contacts[1]
     assert contact_at(contacts, 289, 10) is None
-
-
-def test_silence_begins_after_its_time():
     assert not is_silent(0, 60 * NS, 60.0)
     assert is_silent(0, 60 * NS + 1, 60.0)
-
-
-def test_waits_double_up_to_a_limit():
     waits = [0.0]
     for _ in range(8):
         waits.append(next_wait_s(waits[-1]))
     assert waits[1:] == [0.5, 1.0, 2.0, 4.0, 8.0, 16.0, 30.0, 30.0]
-
-
-def test_only_a_large_offset_of_the_clock_is_a_fault():
     limit = round(CLOCK_LIMIT_S * NS)
     assert clock_fault(None) is None and clock_fault(limit) is None and clock_fault(-limit) is None
     assert "+3600 s" in (clock_fault(3600 * NS) or "") and "-3600 s" in (clock_fault(-3600 * NS) or "")

@@ -1,11 +1,12 @@
-"""Time correlation: whole nanoseconds in and out, drift and offset found, outliers left out."""
+"""Time correlation: whole nanoseconds, drift, offset and outliers; what depends on it moves at once."""
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ground_service.errors import EvaluationError
+from ground_service.errors import EvaluationError, InvalidInput, NotFound
+from ground_service.ingest.service import ingest_file
 from ground_service.missions.timekeeping.core import (
     IDEAL_CLOCK,
     TimeCorrelation,
@@ -16,7 +17,9 @@ from ground_service.missions.timekeeping.core import (
     ticks_of_utc_ns,
     utc_ns_of_ticks,
 )
-from ground_service.missions.timekeeping.recorrelation import TimeReports, fit_runs
+from ground_service.missions.timekeeping.recorrelation import TimePoint, TimeReports, correlate, fit_runs
+from ground_service.missions.timekeeping.store import correlations_on_record
+from ground_service.passes.service import define_pass, parameter_series
 from lunar.timescales import parse_utc, ticks_from_utc_ns, utc_ns_from_ticks
 from tests.ground_service.conftest import cells
 
@@ -68,14 +71,11 @@ def test_one_report_gives_an_offset_and_none_is_refused():
         fit_correlation(ticks[:0], received[:0], light[:0])
 
 
-def test_without_correlations_the_clock_is_ideal():
+def test_the_correlation_nearest_in_time_is_used_and_without_any_the_clock_is_ideal():
     ticks = np.array([0, 1 << 40], dtype=np.int64)
     utc, used = utc_ns_of_ticks(ticks, [])
     assert utc.tolist() == [int(utc_ns_from_ticks(int(t))) for t in ticks]
     assert set(used.tolist()) == {IDEAL_CLOCK}
-
-
-def test_the_correlation_nearest_in_time_is_used_outside_all_of_them():
     one = TimeCorrelation(1, 0, 100, 0, START, 0.0)
     two = TimeCorrelation(2, 1000, 1100, 1000, START, 0.0)
     _, used = utc_ns_of_ticks(np.array([-5, 50, 400, 700, 2000]), [one, two])
@@ -165,12 +165,16 @@ def test_a_single_station_off_by_whole_seconds_of_a_usual_cause_decides_nothing(
     assert {str(one) for one in doubts.values()} == ({words} if remark else set())
 
 
-def test_the_one_of_three_stations_that_agrees_with_the_on_board_clock_counts():
+def test_the_station_that_agrees_with_the_on_board_clock_counts_and_a_corrected_one_from_then_on():
     clocks = {"a": [-18.0] * 12, "b": [37.0] * 12, "c": [0.0] * 12}
     for pattern in ("aaaabbbbbccc", "abcabcabcabc"):
         kept, doubts = doubted_stations(*reports_of_stations(pattern, clocks))
         assert np.flatnonzero(kept).tolist() == [k for k, name in enumerate(pattern) if name == "c"]
         assert {one.station: round(one.difference_s) for one in doubts.values()} == {"canberra": -18, "madrid": 37}
+    given = reports_of_stations("a" * 8, {"a": [0.0] * 8}, [0.0] * 4 + [18.0] * 4)
+    assert doubted_stations(*given)[0].all() and len(clock_runs(*given[:4])) == 2
+    kept, _ = doubted_stations(*reports_of_stations("a" * 8, {"a": [-18.0] * 4 + [0.0] * 4}))
+    assert kept.tolist() == [False] * 4 + [True] * 4
 
 
 def test_two_stations_off_by_the_same_usual_seconds_do_not_outvote_one_that_agrees_with_the_on_board_clock():
@@ -187,16 +191,6 @@ def test_a_station_whose_clock_drifts_is_named_and_the_other_counts():
     fits, doubts = fit_runs(TimeReports(ticks, boot, ticks, received, light, boot, tuple(names)))
     assert [(fit.points, fit.rejected) for _, fit in fits] == [(20, 19)] and sorted(doubts) == list(range(1, 40, 2))
     assert str(doubts[1]) == "the clock of station madrid is 0.390 s ahead of the others"
-
-
-def test_a_clock_that_was_set_after_its_only_station_was_right_is_no_fault_of_the_station():
-    given = reports_of_stations("a" * 8, {"a": [0.0] * 8}, [0.0] * 4 + [18.0] * 4)
-    assert doubted_stations(*given)[0].all() and len(clock_runs(*given[:4])) == 2
-
-
-def test_a_single_station_that_was_corrected_counts_from_then_on():
-    kept, _ = doubted_stations(*reports_of_stations("a" * 8, {"a": [-18.0] * 4 + [0.0] * 4}))
-    assert kept.tolist() == [False] * 4 + [True] * 4
 
 
 @pytest.mark.parametrize("step_s, runs", [(0.1, 1), (1.0, 2)])
@@ -231,3 +225,35 @@ def test_a_correlation_holds_years_away():
     for years in (-9, 5):
         utc_ns = START + years * 365 * 86_400 * NS
         assert ticks_of_utc_ns(utc_ns, [line]) == pytest.approx(int(ticks_from_utc_ns(utc_ns)), abs=2)
+
+
+def test_times_of_samples_follow_the_correlation_in_force(ground, synthetic_pass):
+    vehicle = ingest_file(ground, synthetic_pass.folder / "downlink.cadu").vehicle_id
+    first, last = int(synthetic_pass.utc_ns[0]), int(synthetic_pass.utc_ns[-1])
+    pass_id = define_pass(ground, name="p", start_utc_ns=first - 60 * NS, stop_utc_ns=last + 60 * NS, spacecraft_id=76)
+    ideal = parameter_series(ground, pass_id, "power_w", 1000)
+    points = [
+        TimePoint(int(ticks_from_utc_ns(first + k * 60 * NS)), first + k * 60 * NS + 5 * NS + NS, NS) for k in range(10)
+    ]
+    correlate(ground, vehicle, points)
+    moved = parameter_series(ground, pass_id, "power_w", 1000)
+    # the clock is 5 s slow; one second of the reception times is light time
+    shift = moved.buckets.start_utc_ns - ideal.buckets.start_utc_ns
+    np.testing.assert_allclose(shift, 5 * NS, atol=20_000)
+    assert (ideal.correlation_id, moved.correlation_id) == (0, 1)
+    correlate(ground, vehicle, points)
+    record = ground.read(correlations_on_record, vehicle)
+    assert [(row.id, row.in_force) for row in record] == [(2, True), (1, False)]
+
+
+def test_every_boot_has_a_line_of_its_own(ground, synthetic_pass):
+    vehicle = ingest_file(ground, synthetic_pass.folder / "downlink.cadu").vehicle_id
+    points = [TimePoint(k * 65_536 * 60, k * 60 * NS, 0, boot_count=k // 5) for k in range(10)]
+    assert len(correlate(ground, vehicle, points)) == 2
+
+
+def test_no_points_and_no_vehicle_are_refused(ground):
+    with pytest.raises(InvalidInput, match="expected at least one time report"):
+        correlate(ground, 1, [])
+    with pytest.raises(NotFound, match="vehicle 5"):
+        correlate(ground, 5, [TimePoint(0, 0, 0)])

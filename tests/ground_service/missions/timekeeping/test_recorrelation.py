@@ -95,9 +95,7 @@ def fixed_light_time(monkeypatch):
 
 def ingest(ground, folder, octets, name="d.cadu"):
     (folder / name).write_bytes(octets)
-    vehicle = ingest_file(ground, folder / name).vehicle_id
-    assert vehicle is not None
-    return vehicle
+    return ingest_file(ground, folder / name).vehicle_id
 
 
 def receive(ground, reports):

@@ -30,13 +30,18 @@ from ground_service.planning.service import add_window, change_window
 from ground_service.planning.standing import add_request, plan_tick
 from ground_service.store import repository
 from ground_service.store.event_kinds import AlarmChanged, read_events
+from ground_service.telemetry.values import last_packet, packets_after
 from ground_service.worker.scheduler import Watch
+from tests.ground_service.conftest import steps_of
 from tmtc.dictionary.payload import DICTIONARY
 from tmtc.downlink import encode_cadus
 
 SPACECRAFT = 76
 SECOND = 65_536
 START = 1_000_000_000 * SECOND
+
+
+WATCHED = core.WATCHED_APIDS
 
 
 def housekeeping(second, temperature_c):
@@ -139,6 +144,18 @@ def test_packets_that_arrive_again_are_not_counted_again(ground):
     assert examine_packets(ground, vehicle) == 0
 
 
+def test_new_packets_are_found_without_a_search_of_those_before(ground):
+    steps = []
+    for seconds in (range(20), range(20, 1000)):
+        receive(ground, *(housekeeping(second, 20.0) for second in seconds))
+        with ground.database.reading() as connection:
+            last = last_packet(connection, 1)
+            found, work = steps_of(connection, lambda given, last=last: packets_after(given, 1, last - 5, WATCHED, 9))
+        assert len(found.ids) == 5
+        steps.append(work)
+    assert steps[1] < 1.5 * steps[0] + 5
+
+
 def test_late_packets_of_a_cleared_alarm_do_not_raise_it_again(ground):
     receive(ground, event(10))
     acknowledge(ground)
@@ -179,13 +196,10 @@ def test_an_alarm_is_shelved_in_mission_time_and_its_records_are_in_time_of_day(
     receive(ground, event(0))
     moment = utc_now_ns() + 1000 * 86_400 * 10**9
     set_mission_clock(lambda: moment)
-    try:
-        shelved = shelve_alarm(ground, alarms(ground)[0].id, moment + 10**9, "known", actor="eva")
-        assert shelved.state == "shelved" and abs(shelved.history[-1].time.utc_ns - utc_now_ns()) < 600e9
-        moment += 2 * 10**9
-        assert [one.state for one in alarms(ground)] == ["raised"]
-    finally:
-        set_mission_clock()
+    shelved = shelve_alarm(ground, alarms(ground)[0].id, moment + 10**9, "known", actor="eva")
+    assert shelved.state == "shelved" and abs(shelved.history[-1].time.utc_ns - utc_now_ns()) < 600e9
+    moment += 2 * 10**9
+    assert [one.state for one in alarms(ground)] == ["raised"]
 
 
 def test_changes_are_published(ground):
@@ -229,59 +243,56 @@ def test_what_stops_operations_is_an_alarm_until_it_ends(tmp_path):
     link = b'[[links]]\nname = "lab"\nkind = "tcp"\nuplink = "127.0.0.1:9"\n'
     moment = START // SECOND * 10**9
     set_mission_clock(lambda: moment)
-    try:
-        with open_ground(tmp_path) as ground:
-            add_mission(ground, text + link)
-            add_request(ground, StandingRequestIn(name="none", spacecraft_id=76, windows=1), actor="ann")
-            entry = WindowEntry("w", moment + 3600 * 10**9, moment + 4200 * 10**9, 15.0, 76)
-            window = add_window(ground, entry, actor="planner").id
-            change_window(ground, window, actor="planner", changes={}, decision="approved")
-            note_reason(ground, window, "cannot be released")
-            plan_tick(ground, moment)
-            watch = Watch(ground, holds_s=0.0)
-            watch.tick()
-            names = {"link_process_gone", "window_not_released", "plan_empty"}
-            assert {one.name for one in alarms(ground, "raised")} == names
-            watch.tick()  # no time has passed since
-            assert {one.name for one in alarms(ground, "raised")} == {*names, "mission_time_stopped"}
-            assert {(one.source, one.severity) for one in alarms(ground)} == {("operations", "alarm")}
-            # The process of the links is back; they are refused, and a window is on board.
-            assert acquire(ground, declared_links(ground)["lab"], "links", 10**12)
-            watch.tick()
-            assert active(ground) == {"no_link", "mission_time_stopped", "window_not_released", "plan_empty"}
-            ground.write(repository.change, repository.WINDOWS, window, state="uplinked")
-            watch.tick()
-            assert active(ground) == {"no_link", "mission_time_stopped", "spacecraft_gone", "plan_empty"}
-            moment += 10**9
-            watch.tick()  # mission time passes: the link alone is missing
-            assert active(ground) == {"no_link", "plan_empty"}
-            watch.tick()
-            change_state(ground, "lab", "links", "connected", None)
-            watch.tick()  # mission time stands still, but the link is there
-            assert active(ground) == {"mission_time_stopped", "plan_empty"}
-            moment += 10**9
-            watch.tick()
-            assert "mission_time_stopped" not in active(ground)
-            ground.write(repository.change, repository.WINDOWS, window, state="downlinked")
-            watch.tick()
-            assert not any(one.name == "report_overdue" for one in alarms(ground))
-            moment += 2 * 86_400 * 10**9
-            watch.tick()
-            assert active(ground) == {"report_overdue", "plan_empty"}
-            Watch(ground).tick()  # another process, which knows no ages
-            assert active(ground) == {"report_overdue", "plan_empty"}
-            watch.tick()  # no time has passed since
-            other = Watch(ground)
-            other.tick()
-            assert "mission_time_stopped" in active(ground)
-            with ground.database.writing() as connection:
-                repository.change(connection, repository.WINDOWS, window, state="processed")
-                repository.change(connection, repository.STANDING_REQUESTS, 1, state="ended")
-            add_mission(ground, text)
-            other.tick()
-            assert active(ground) == set()
-    finally:
-        set_mission_clock()
+    with open_ground(tmp_path) as ground:
+        add_mission(ground, text + link)
+        add_request(ground, StandingRequestIn(name="none", spacecraft_id=76, windows=1), actor="ann")
+        entry = WindowEntry("w", moment + 3600 * 10**9, moment + 4200 * 10**9, 15.0, 76)
+        window = add_window(ground, entry, actor="planner").id
+        change_window(ground, window, actor="planner", changes={}, decision="approved")
+        note_reason(ground, window, "cannot be released")
+        plan_tick(ground, moment)
+        watch = Watch(ground, holds_s=0.0)
+        watch.tick()
+        names = {"link_process_gone", "window_not_released", "plan_empty"}
+        assert {one.name for one in alarms(ground, "raised")} == names
+        watch.tick()  # no time has passed since
+        assert {one.name for one in alarms(ground, "raised")} == {*names, "mission_time_stopped"}
+        assert {(one.source, one.severity) for one in alarms(ground)} == {("operations", "alarm")}
+        # The process of the links is back; they are refused, and a window is on board.
+        assert acquire(ground, declared_links(ground)["lab"], "links", 10**12)
+        watch.tick()
+        assert active(ground) == {"no_link", "mission_time_stopped", "window_not_released", "plan_empty"}
+        ground.write(repository.change, repository.WINDOWS, window, state="uplinked")
+        watch.tick()
+        assert active(ground) == {"no_link", "mission_time_stopped", "spacecraft_gone", "plan_empty"}
+        moment += 10**9
+        watch.tick()  # mission time passes: the link alone is missing
+        assert active(ground) == {"no_link", "plan_empty"}
+        watch.tick()
+        change_state(ground, "lab", "links", "connected", None)
+        watch.tick()  # mission time stands still, but the link is there
+        assert active(ground) == {"mission_time_stopped", "plan_empty"}
+        moment += 10**9
+        watch.tick()
+        assert "mission_time_stopped" not in active(ground)
+        ground.write(repository.change, repository.WINDOWS, window, state="downlinked")
+        watch.tick()
+        assert not any(one.name == "report_overdue" for one in alarms(ground))
+        moment += 2 * 86_400 * 10**9
+        watch.tick()
+        assert active(ground) == {"report_overdue", "plan_empty"}
+        Watch(ground).tick()  # another process, which knows no ages
+        assert active(ground) == {"report_overdue", "plan_empty"}
+        watch.tick()  # no time has passed since
+        other = Watch(ground)
+        other.tick()
+        assert "mission_time_stopped" in active(ground)
+        with ground.database.writing() as connection:
+            repository.change(connection, repository.WINDOWS, window, state="processed")
+            repository.change(connection, repository.STANDING_REQUESTS, 1, state="ended")
+        add_mission(ground, text)
+        other.tick()
+        assert active(ground) == set()
 
 
 def test_an_alarm_states_the_procedure_of_the_mission_in_force(ground):
