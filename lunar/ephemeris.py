@@ -366,7 +366,7 @@ def clipped(ephemeris: Ephemeris, start_utc_ns: int, stop_utc_ns: int) -> Epheme
 def read_text(path: Path | str, expected: str) -> str:
     """Return the text of a file; `DataFileError` where it cannot be read or is no text."""
     try:
-        return Path(path).read_text(encoding="utf-8")
+        return Path(path).read_text(encoding="utf-8-sig")
     except OSError as error:
         raise DataFileError(path, "", expected, error.strerror or str(error)) from None
     except UnicodeDecodeError as error:

@@ -12,7 +12,7 @@ import pickle
 import subprocess
 import sys
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from functools import partial
 from importlib.metadata import version
 from pathlib import Path
@@ -48,7 +48,7 @@ class Drawings(dict[str, str]):
         return _svg_of(one)
 
     def prepare(self, pictures: Sequence[Picture]) -> None:
-        """Draw the pictures that take less time together than one by one."""
+        """Draw pictures ahead, where that takes less time; nothing here."""
 
 
 def _svg_of(one: Picture) -> str:
@@ -66,7 +66,8 @@ class KeptDrawings(Drawings):
         if self._processes is None:
             return
         names = {one.key: f"figure-{drawing_hash(one)}" for one in pictures}
-        missing = [one for one in pictures if kept(names[one.key]) is None]
+        self.update({key: octets.decode() for key, name in names.items() if (octets := kept(name)) is not None})
+        missing = [one for one in pictures if one.key not in self]
         for one, svg in zip(missing, self._processes.draw(missing), strict=False):
             keep(names[one.key], svg.encode(), KEPT_FIGURES)
             self[one.key] = svg
@@ -105,8 +106,10 @@ class DrawingProcesses:
 
 @contextmanager
 def drawing_processes(wanted: bool) -> Iterator[DrawingProcesses | None]:
-    """Yield started processes if they are wanted."""
-    started = DrawingProcesses() if wanted else None
+    """Yield started processes if they are wanted and the machine has room for them."""
+    started = None
+    with suppress(OSError):
+        started = DrawingProcesses() if wanted else None
     try:
         yield started
     finally:
@@ -146,6 +149,8 @@ def _octets(value: Any) -> Iterator[bytes]:
     if isinstance(value, np.ndarray) and not value.dtype.hasobject:
         yield f"{value.dtype.str}{value.shape}".encode()
         yield value.tobytes()
+    elif isinstance(value, list | tuple) and all(type(part) in (str, int, float) for part in value):
+        yield f"{tuple(value)!r} ".encode()
     elif isinstance(value, list | tuple | np.ndarray):
         yield f"{len(value)} of ".encode()
         for part in value:

@@ -168,10 +168,10 @@ def make_report(
             )
     folder = out if out is not None else ground.home / "reports" / f"pass-{pass_id}"
     html, data = folder / "report.html", folder / "report.json"
-    _write_whole(html, documents["html"])
-    _write_whole(data, documents["json"])
     with suppress(OSError):
         (folder / "report.pdf").unlink()  # of the report before
+    _write_whole(html, documents["html"])
+    _write_whole(data, documents["json"])
     return MadeReport(identity, pass_id, html, data, summary)
 
 

@@ -32,6 +32,11 @@ def packet_headers(
     return {"apid": rows[:, 0], "ticks": rows[:, 1], "sequence_count": rows[:, 2]}
 
 
+def count_packets(connection: Connection, vehicle: int) -> int:
+    """Return the number of stored packets of a vehicle."""
+    return int(connection.execute(select(func.count()).where(PACKETS.c.vehicle_id == vehicle)).scalar_one())
+
+
 def whole_numbers(connection: Connection, query: Select[Any]) -> IntArray:
     """Return the rows of a query of whole numbers (n, columns).
 

@@ -19,7 +19,7 @@ from lunar.arrays import FloatArray, IntArray
 from lunar.constants import NS
 from lunar.ephemeris import Ephemeris, EphemerisSegment, parse_numbers, resampled
 from lunar.errors import DataFileError, EphemerisError, TimeFormatError, UnknownFrameError, UnknownTimeSystemError
-from lunar.timescales import format_tai, parse_tai, tdb_s_from_tai_ns, utc_ns_from_tai_ns
+from lunar.timescales import format_tai, in_leap_second, parse_tai, tdb_s_from_tai_ns, utc_ns_from_tai_ns
 from lunar.visibility import subsatellite
 
 _STATE_WIDTH = {"EPHEMERISTIMEPOSVEL": 7, "EPHEMERISTIMEPOSVELACC": 10}
@@ -298,8 +298,17 @@ def format_csv(ephemeris: Ephemeris, orientation: frames.Orientation) -> str:
 
 
 def format_tum(ephemeris: Ephemeris) -> str:
-    """Return poses in TUM form: seconds since 1970 UTC, ICRF metres, and the RTN axes as the body's attitude."""
+    """Return poses in TUM form: seconds since 1970 UTC, ICRF metres, and the RTN axes as the body's attitude.
+
+    Raises
+    ------
+    EphemerisError
+        Where a state is within a leap second, which has no count of its own.
+    """
     tai_ns, position_m, velocity_m_s = _states(ephemeris)
+    if (leap := tai_ns[in_leap_second(tai_ns)]).size:
+        found = format_tai(int(leap[0]))
+        raise EphemerisError(f"TUM, seconds since 1970: expected states outside of leap seconds, found {found}")
     icrf_from_rtn = np.swapaxes(frames.rtn_from_inertial(position_m, velocity_m_s), -1, -2)
     # Scalar last in this format.
     attitude = np.roll(frames.continuous_quaternions(frames.quaternion_from_matrix(icrf_from_rtn)), -1, axis=-1)

@@ -28,7 +28,7 @@ from ground_service.jobs.service import unfinished_jobs as unfinished
 from ground_service.planning.model import Window
 from ground_service.store.events import position_of, read_events
 from ground_service.store.vehicles import all_vehicles
-from ground_service.telemetry.store import packet_headers
+from ground_service.telemetry.store import count_packets
 from ground_service.worker.follow_up import CONSUMER, KINDS
 from lunar.datafolder import DataFolder
 
@@ -129,11 +129,8 @@ class MissionGround:
     def packets_received(self, spacecraft_id: int) -> int:
         """Return the number of packets of a spacecraft in the archive."""
         with self.ground.database.reading() as connection:
-            return sum(
-                len(packet_headers(connection, one.id)["apid"])
-                for one in all_vehicles(connection)
-                if one.ccsds_id == spacecraft_id
-            )
+            mine = [one.id for one in all_vehicles(connection) if one.ccsds_id == spacecraft_id]
+            return sum(count_packets(connection, vehicle) for vehicle in mine)
 
     def audit_head(self) -> int:
         """Return the number of the newest entry of the audit log."""

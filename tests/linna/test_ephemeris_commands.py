@@ -96,7 +96,7 @@ def test_a_kernel_without_its_number_an_unknown_format_and_a_file_cut_short_are_
 
 def test_interpolate_gives_states_at_the_epochs_of_a_file(oem_path, tmp_path, typed):
     epochs = tmp_path / "epochs.txt"
-    epochs.write_text("# two epochs\n2029-08-07T00:00:00Z\n\n2029-08-07T12:34:56.789123Z  # odd\n")
+    epochs.write_text("\ufeff# two epochs\n2029-08-07T00:00:00Z\n\n2029-08-07T12:34:56.789123Z  # odd\n")
     figures = typed(f"orbit interpolate {oem_path} --epochs {epochs} --json")
     first, second = figures["states"]
     assert set(first) == {*("epoch", "position_km", "velocity_km_s", "latitude_deg", "longitude_deg", "altitude_km")}

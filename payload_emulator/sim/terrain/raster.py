@@ -41,8 +41,14 @@ SMALL_EXPONENT = 2.2
 CATALOGUE_DENSITY_2KM = 0.0080
 """Craters above 2 km per km2 in LU1319381 (222,451 over 53 of 72 tiles); scales the smaller ones by place."""
 
-_Windows = dict[RasterLayer, tuple[int, int, Heights]]
-"""Newest window of each layer: first row, first column, and what `_window` returns."""
+_LONGEST_MOVE = 2.5
+"""Above the distance from a hole to the nearest pixel with a height: 2.2, the longest move of OpenCV's transform."""
+
+_Pixels = tuple[Heights, BoolArray, Heights]
+"""Heights of a window with holes filled, the holes, and the weight that rises from 0 at their edges (if any)."""
+
+_Windows = dict[RasterLayer, tuple[int, int, _Pixels]]
+"""Newest window of each layer: first row, first column and pixels."""
 
 
 class RasterTerrain(Terrain):
@@ -180,14 +186,13 @@ class RasterTerrain(Terrain):
         margin = max(reach, feather) + 3
         top, left = math.floor(rows[0]) - margin, math.floor(columns[0]) - margin
         height, width = math.ceil(rows[-1]) + margin + 1 - top, math.ceil(columns[-1]) + margin + 1 - left
-        pixels = _window(layer, top, left, height, width, feather, windows)
-        source, hole = np.ascontiguousarray(pixels[0]), pixels[1:2]
+        source, hole, smooth = _window(layer, top, left, height, width, feather, windows)
         out = np.zeros((latitude.size, longitude.size), np.float32)
-        if len(hole) and hole.all():
+        if hole.all():
             return out, np.zeros_like(out)
         weight = np.ones_like(out)
         if hole.any():
-            kernels.resample_cubic(np.ascontiguousarray(pixels[2]), *_span(rows, top), *_span(columns, left), weight)
+            kernels.resample_cubic(smooth, *_span(rows, top), *_span(columns, left), weight)
             weight = np.clip(weight, 0.0, 1.0)
         if sigma > 0.0:
             source = _smoothed(source, sigma, reach)
@@ -218,36 +223,38 @@ class RasterTerrain(Terrain):
 
 def _window(
     layer: RasterLayer, top: int, left: int, height: int, width: int, feather: int, windows: _Windows
-) -> Heights:
-    """Return heights (1, rows, columns) of a window; with holes, which are filled, also these and weights, (3, ...).
-
-    Weights rise from 0 at holes. Cut from the window in ``windows`` if that holds this one; put there otherwise.
-    """
+) -> _Pixels:
+    """Return what `_Pixels` says of a window, cut from the one in ``windows`` if that holds it, else put there."""
     if layer in windows:
         first_row, first_column, pixels = windows[layer]
         y, x = top - first_row, left - first_column
-        part = pixels[:, max(y, 0) : y + height, max(x, 0) : x + width]
-        if part.shape[1:] == (height, width):
-            return part
-    source = layer.read(top, left, height, width)
+        part = np.s_[max(y, 0) : y + height, max(x, 0) : x + width]
+        if pixels[0][part].shape == (height, width):
+            source, hole, smooth = pixels
+            return np.ascontiguousarray(source[part]), hole[part], np.ascontiguousarray(smooth[part])
+    source = smooth = layer.read(top, left, height, width)
     hole = np.isnan(source)
-    pixels = source[None]
-    if hole.all():
-        pixels = np.stack([source, hole, source])
-    elif hole.any():
+    if hole.any() and not hole.all():
         import cv2
 
-        inside = cv2.distanceTransform((~hole).astype(np.uint8), cv2.DIST_L2, 5)
+        # No hole takes a height from beyond this box, and no weight outside it is below 1.
+        found = (np.flatnonzero(hole.any(axis)) for axis in (1, 0))
+        box = tuple(slice(max(at[0] - feather - 3, 0), at[-1] + feather + 4) for at in found)
+        empty, values = hole[box], source[box]
+        inside = cv2.distanceTransform((~empty).astype(np.uint8), cv2.DIST_L2, 5)
         _, labels = cv2.distanceTransformWithLabels(
-            hole.astype(np.uint8), cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL
+            empty.astype(np.uint8), cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL
         )
         # Holes take the nearest height, so that the smoothing has something to work on at edges.
+        edge = (inside > 0.0) & (inside < _LONGEST_MOVE)
         of_label = np.zeros(int(labels.max()) + 1, np.float32)
-        of_label[labels[~hole]] = source[~hole]
-        edge = np.clip((inside - 1.0) / feather, 0.0, 1.0)
-        pixels = np.stack([of_label[labels], hole, edge * edge * (3.0 - 2.0 * edge)]).astype(np.float32)
-    windows[layer] = top, left, pixels
-    return pixels
+        of_label[labels[edge]] = values[edge]
+        values[empty] = of_label[labels[empty]]
+        share = np.clip((inside - 1.0) / feather, 0.0, 1.0)
+        smooth = np.ones_like(source)
+        smooth[box] = share * share * (3.0 - 2.0 * share)
+    windows[layer] = top, left, (source, hole, smooth)
+    return source, hole, smooth
 
 
 def _share_below(diameter_m: float) -> float:

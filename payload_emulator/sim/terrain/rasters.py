@@ -37,7 +37,7 @@ from payload_emulator.errors import TerrainError, install_hint
 from payload_emulator.sim.terrain.tiles import Heights
 
 CHUNK_PIXELS = 1024
-CHUNK_LIMIT_OCTETS = 32 << 20
+CHUNK_LIMIT_OCTETS = 24 << 20
 """Decoded pixels that a terrain keeps in memory of all its files: those under neighbouring tiles."""
 
 KEPT_PIXELS = 128

@@ -52,7 +52,7 @@ ALBEDO_SHIFT = 6
 MEAN_ALBEDO = 0.12
 """Normal albedo of an average lunar surface (the maps of Hapke 2012 span about 0.06 to 0.2)."""
 
-KEPT_TILES = 32
+KEPT_TILES = 16
 """Tiles of 1 MB that are kept for later windows: a pass over new ground needs each in neighbouring frames only, and
 reads others again from disk."""
 

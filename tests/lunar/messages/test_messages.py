@@ -4,6 +4,7 @@ import csv
 import gzip
 import io
 import zipfile
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -23,7 +24,7 @@ from lunar.messages.ephemeris_files import load_ephemeris
 from lunar.messages.oem import format_oem
 from lunar.messages.oem_xml import format_oem_xml, parse_oem_xml
 from lunar.messages.stk import format_csv, format_tum
-from lunar.timescales import from_tai_ns, parse_tai, parse_utc
+from lunar.timescales import from_tai_ns, parse_tai, parse_utc, utc_ns_from_tai_ns
 
 START = parse_utc("2029-08-07T00:00:00")
 
@@ -424,6 +425,14 @@ def test_csv_holds_states_and_places_with_their_units():
     assert abs(float(rows[7]["y_km"]) * 1e3 - POSITION_M[7, 1]) < 1e-6
     assert all(0.0 <= float(row["longitude_deg"]) < 360.0 for row in rows)
     assert abs(float(rows[0]["altitude_km"]) - 30.78) < 1e-6
+
+
+def test_tum_has_no_place_for_a_state_within_a_leap_second():
+    (one,) = EPHEMERIS.segments
+    moved = one.tai_ns - one.tai_ns[3] + parse_tai("2016-12-31T23:59:60.5")
+    leap = replace(one, tai_ns=moved, utc_ns=utc_ns_from_tai_ns(moved))
+    with pytest.raises(EphemerisError, match=r"outside of leap seconds, found 2016-12-31T23:59:60\.500Z"):
+        format_tum(Ephemeris((leap,)))
 
 
 def test_tum_holds_metres_and_the_attitude_of_the_rtn_axes_scalar_last():

@@ -13,7 +13,7 @@ from payload_emulator.errors import TerrainError
 from payload_emulator.sim.terrain import kernels
 from payload_emulator.sim.terrain.albedo import open_albedo
 from payload_emulator.sim.terrain.opening import open_terrain
-from payload_emulator.sim.terrain.raster import RasterTerrain
+from payload_emulator.sim.terrain.raster import RasterTerrain, _window
 from payload_emulator.sim.terrain.rasters import CHUNK_LIMIT_OCTETS, ChunkCache, RasterFile, open_layers
 from tests.lazy import Lazy
 from tests.payload_emulator.sim.rasters import write_raster
@@ -514,3 +514,29 @@ def test_smoothing_adds_its_terms_one_by_one_to_the_last_bit():
     expected = half.copy()
     expected[:, 2:-2] = sum(w * half[:, k : 53 + k] for k, w in enumerate(weights))
     assert np.array_equal(kernels.smooth(values, weights), expected)
+
+
+class Plane:
+    """Layer whose heights are different everywhere, with a hole."""
+
+    def read(self, top, left, height, width):
+        y, x = np.mgrid[top : top + height, left : left + width]
+        return np.where((y > 20) & (x > 15) & (x < 40), np.nan, 1000.0 * y + x).astype(np.float32)
+
+
+def test_holes_take_the_nearest_height_and_weights_rise_beside_them():
+    source, hole, weight = _window(Plane(), 0, 0, 50, 60, 3, {})
+    assert_array_equal(source[30, 14:18], [30014.0, 30015.0, 30015.0, 30015.0])
+    assert_array_equal(source[19:23, 27], [19027.0, 20027.0, 20027.0, 20027.0])
+    assert_allclose(weight[30, 11:17], [1.0, 1.0, 20 / 27, 7 / 27, 0.0, 0.0], atol=1e-6)
+    assert_allclose(weight[16:22, 27], [1.0, 1.0, 20 / 27, 7 / 27, 0.0, 0.0], atol=1e-6)
+    assert hole[30, 16] and not hole[30, 15]
+
+
+def test_a_window_cut_from_a_wider_one_is_the_window_read_alone():
+    layer, windows = Plane(), {}
+    for part, kept in (((0, 0, 50, 60), 0), ((9, 7, 30, 40), 0), ((9, 7, 30, 60), 7), ((12, 9, 10, 5), 7)):
+        cut, alone = _window(layer, *part, 3, windows), _window(layer, *part, 3, {})
+        assert all(np.array_equal(one, other) for one, other in zip(cut[:2], alone[:2], strict=True))
+        assert not cut[1].any() or (np.array_equal(cut[2], alone[2]) and cut[2].min() == 0.0 and cut[2].max() == 1.0)
+        assert windows[layer][1] == kept

@@ -1,6 +1,10 @@
 """Performance over stored reports, and monthly reports by operation, command, rule and nightly job."""
 
+import hashlib
 import json
+import threading
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import nullcontext
 
 import pytest
 from pytest import raises
@@ -8,6 +12,7 @@ from pytest import raises
 from ground_service.client.local import local_client
 from ground_service.clock import set_mission_clock, utc_now_ns
 from ground_service.errors import InvalidInput
+from ground_service.evaluation import service as evaluation
 from ground_service.evaluation.model import StoredReport
 from ground_service.evaluation.performance import service
 from ground_service.evaluation.performance.model import MonthlyReportFilter
@@ -22,7 +27,7 @@ from ground_service.evaluation.performance.service import (
     performance,
 )
 from ground_service.evaluation.service import make_report
-from ground_service.evaluation.store import add_report
+from ground_service.evaluation.store import add_report, get_report
 from ground_service.http.model import UtcTime
 from ground_service.jobs.service import enter_job
 from ground_service.passes.archive_import import import_archive
@@ -36,6 +41,7 @@ from ground_service.worker.upkeep import nightly
 from linna.cli import run
 from linna.commands.results import performance_lines
 from lunar.timescales import parse_utc
+from reports import pdf_pages
 from tests.ground_service.conftest import ALTITUDE_M, SPACECRAFT
 
 DAY_NS = 86_400_000_000_000
@@ -141,6 +147,25 @@ def test_a_report_states_the_conditions_of_its_pass(either, flown):
     flight = add_pass(either, 0)
     found = performance(either, SPACECRAFT)
     assert (found.instance, [one.pass_id for one in found.passes]) == ("flight", [flight])
+
+
+def test_processes_that_make_a_pdf_at_the_same_time_keep_one_file(either, monkeypatch):
+    key = f"{add_pass(either, 0):032x}"
+    blob = either.read(get_report, key).html_sha256
+    either.write(repository.change, repository.REPORTS, key, print_sha256=blob)
+    both = threading.Barrier(2, timeout=30.0)
+
+    def pdf_of(form, page):
+        both.wait()
+        return form + page.encode()
+
+    monkeypatch.setattr(pdf_pages, "pdf_of", pdf_of)
+    monkeypatch.setattr(evaluation, "_typesetting", nullcontext())  # as other processes have their own
+    with ThreadPoolExecutor(2) as pool:
+        made = list(pool.map(lambda _: evaluation.report_document(either, key, "pdf"), range(2)))
+    assert made == [b"xx", b"xx"]
+    assert either.read(get_report, key).pdf_sha256 == hashlib.sha256(b"xx").hexdigest()
+    assert evaluation.report_document(either, key, "pdf") == b"xx"  # without waiting for a second one
 
 
 def test_passes_are_grouped_and_changes_found(either):
