@@ -245,7 +245,7 @@ def test_an_axis_of_one_tick_shows_what_matplotlib_does():
 
 
 def test_two_processes_draw_as_one_does(small, tmp_path, monkeypatch):
-    """What they cannot draw is left to the process that asks."""
+    """The process that asks draws the rest."""
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "kept"))
     pictures = [one for one in pass_document(small).blocks if isinstance(one, Picture)][:3]
     with drawing_processes(True) as processes:

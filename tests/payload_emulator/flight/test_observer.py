@@ -1,4 +1,4 @@
-"""What of a frame reaches the estimators, what is reported, and how reads and troubles are counted."""
+"""Parts of a frame that reach the estimators, reports of it, and counts of reads and troubles."""
 
 import re
 from dataclasses import replace

@@ -524,7 +524,7 @@ class Plane:
         return np.where((y > 20) & (x > 15) & (x < 40), np.nan, 1000.0 * y + x).astype(np.float32)
 
 
-def test_holes_take_the_nearest_height_and_weights_rise_beside_them():
+def test_holes_take_the_nearest_height_and_weights_rise_away_from_them():
     source, hole, weight = _window(Plane(), 0, 0, 50, 60, 3, {})
     assert_array_equal(source[30, 14:18], [30014.0, 30015.0, 30015.0, 30015.0])
     assert_array_equal(source[19:23, 27], [19027.0, 20027.0, 20027.0, 20027.0])
