@@ -22,9 +22,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pytest
 from fastapi import routing
 from httpx._transports import default as httpx_transports
+from pytest import MonkeyPatch, fixture, skip
 from sqlalchemy import create_engine, text
 from sqlalchemy.util import LRUCache
 
@@ -73,24 +73,24 @@ def cells(table):
     return [[cell.strip() for cell in row.split("|")] for row in table.strip().splitlines()]
 
 
-@pytest.fixture(scope="session", autouse=True)
+@fixture(scope="session", autouse=True)
 def name_of_the_test_client():
     """Allow the host name that the test client of the web framework gives itself."""
-    with pytest.MonkeyPatch.context() as environment:
+    with MonkeyPatch.context() as environment:
         environment.setenv("LINNA_ALLOWED_HOSTS", "testserver")
         yield
 
 
-@pytest.fixture(scope="session", autouse=True)
+@fixture(scope="session", autouse=True)
 def one_tls_context():
     """Read the trusted certificates once: each HTTP client would read them."""
-    with pytest.MonkeyPatch.context() as patch:
+    with MonkeyPatch.context() as patch:
         made = functools.cache(httpx_transports.create_ssl_context)
         patch.setattr(httpx_transports, "create_ssl_context", made)
         yield
 
 
-@pytest.fixture(scope="session", autouse=True)
+@fixture(scope="session", autouse=True)
 def one_description():
     """Make the OpenAPI document, which is the same for every application, once: it takes two seconds."""
     describe, made = DescribedApi.openapi, list[dict[str, Any]]()
@@ -99,12 +99,12 @@ def one_description():
         made[:] = made or [describe(app)]
         return made[0]
 
-    with pytest.MonkeyPatch.context() as patch:
+    with MonkeyPatch.context() as patch:
         patch.setattr(DescribedApi, "openapi", openapi)
         yield
 
 
-@pytest.fixture(scope="session", autouse=True)
+@fixture(scope="session", autouse=True)
 def one_set_of_routes():
     """Resolve the routes, which are the same for every application, once: the first request would do it in 0.2 s."""
     resolve, made = routing._EffectiveRouteContext.from_api_route, dict[tuple[int, str], Any]()
@@ -115,7 +115,7 @@ def one_set_of_routes():
             made[key] = resolve(original_route=original_route, include_context=include_context)
         return made[key]
 
-    with pytest.MonkeyPatch.context() as patch:
+    with MonkeyPatch.context() as patch:
         patch.setattr(routing._EffectiveRouteContext, "from_api_route", from_api_route)
         yield
 
@@ -130,7 +130,7 @@ class Statements(LRUCache):
         super().__setitem__(key[1:], value)
 
 
-@pytest.fixture(scope="session", autouse=True)
+@fixture(scope="session", autouse=True)
 def one_set_of_statements():
     """Compile a statement once for all databases of a kind: it is half of the time of an import into a new one."""
     create, kept = databases.create_engine, defaultdict(lambda: Statements(4000))
@@ -140,12 +140,12 @@ def one_set_of_statements():
         engine._compiled_cache = kept[engine.dialect.name]
         return engine
 
-    with pytest.MonkeyPatch.context() as patch:
+    with MonkeyPatch.context() as patch:
         patch.setattr(databases, "create_engine", create_engine)
         yield
 
 
-@pytest.fixture(scope="session", autouse=True)
+@fixture(scope="session", autouse=True)
 def undrawn_figures():
     """Leave figures of reports blank in this folder: they take most of the time of a report; what draws is yielded."""
     draw = Drawings.svg
@@ -154,20 +154,20 @@ def undrawn_figures():
         is_here = os.environ.get("PYTEST_CURRENT_TEST", "").startswith("tests/ground_service/")
         return '<svg viewBox="0 0 1 1"></svg>' if is_here else draw(*given)
 
-    with pytest.MonkeyPatch.context() as patch:
+    with MonkeyPatch.context() as patch:
         patch.setattr(Drawings, "svg", svg)
         patch.setattr(drawings, "drawing_processes", lambda _wanted: nullcontext())
         yield draw
 
 
-@pytest.fixture
+@fixture
 def client(tmp_path):
     """An empty service without users that does its jobs in the requests."""
     with TestClient(create_app(Settings(home=tmp_path / "home"), inline_jobs=True)) as opened:
         yield opened
 
 
-@pytest.fixture
+@fixture
 def guarded(tmp_path):
     """An empty service with one user of each role, and the headers of each."""
     with TestClient(create_app(Settings(home=tmp_path / "guarded"), inline_jobs=True)) as opened:
@@ -176,7 +176,7 @@ def guarded(tmp_path):
         yield opened, {role: {"Authorization": f"Bearer {token}"} for role, token in tokens.items()}
 
 
-@pytest.fixture(scope="session", autouse=True)
+@fixture(scope="session", autouse=True)
 def copied_schema(tmp_path_factory):
     """Copy the tables of new SQLite databases from one that was migrated; the migration itself is yielded."""
     migrate, lock = databases.upgrade_database, threading.Lock()
@@ -192,7 +192,7 @@ def copied_schema(tmp_path_factory):
             with made.engine.connect() as source, database.engine.connect() as target:
                 source.connection.driver_connection.backup(target.connection.driver_connection)
 
-    with pytest.MonkeyPatch.context() as patch:
+    with MonkeyPatch.context() as patch:
         patch.setattr(databases, "upgrade_database", upgrade)
         yield migrate
     made.engine.dispose()
@@ -257,7 +257,7 @@ def _catalogue(latitude_rad, longitude_rad, rng):
     )
 
 
-@pytest.fixture(scope="session")
+@fixture(scope="session")
 def make_pass(tmp_path_factory):
     """A function that writes a synthetic pass archive of `frames` frames."""
 
@@ -393,13 +393,13 @@ def _housekeeping(k):
     return values | known | {"frames_processed": k, "temperature_c": 20.0 + 0.1 * k}
 
 
-@pytest.fixture(scope="session")
+@fixture(scope="session")
 def synthetic_pass(make_pass):
     """The pass that most tests look at; not to be altered."""
     return make_pass()
 
 
-@pytest.fixture(params=["sqlite", "postgresql"])
+@fixture(params=["sqlite", "postgresql"])
 def either(request, tmp_path):
     """An empty service on each database."""
     url = request.getfixturevalue("migrated_postgres")() if request.param == "postgresql" else None
@@ -408,7 +408,7 @@ def either(request, tmp_path):
         yield ground
 
 
-@pytest.fixture
+@fixture
 def ground(tmp_path):
     """An empty ground service with a SQLite database of its own."""
     opened = open_ground(tmp_path / "home")
@@ -425,7 +425,7 @@ class FlyablePass:
     packets: list[bytes]
 
 
-@pytest.fixture(scope="session")
+@fixture(scope="session")
 def make_flyable(make_pass):
     """A function that writes a synthetic pass archive with what its payload was given: plain gray images."""
     import io
@@ -467,7 +467,7 @@ costs = json.loads((build / "costs.json").read_text())
 """
 
 
-@pytest.fixture(scope="session")
+@fixture(scope="session")
 def make_build(tmp_path_factory):
     """A function that writes a build: a program that sends packets prepared for each pass, or any other script."""
 
@@ -496,12 +496,12 @@ def free_port():
         return int(probe.getsockname()[1])
 
 
-@pytest.fixture(scope="module")
+@fixture(scope="module")
 def redis_url():
     """A Redis server of the tests' own, its user as restricted as in the distributed form."""
     program = shutil.which("redis-server")
     if program is None:
-        pytest.skip("redis-server is not installed")
+        skip("redis-server is not installed")
     port = free_port()
     script = (Path(__file__).resolve().parents[2] / "deploy/redis.sh").read_text()
     (rights,) = re.findall(r"^rights='(.*)'$", script, re.MULTILINE)
@@ -523,12 +523,12 @@ def redis_url():
             server.wait(20)
 
 
-@pytest.fixture(scope="session")
+@fixture(scope="session")
 def postgres_server():
     """URL of a PostgreSQL server of the tests' own, without the name of a database."""
     found = sorted(Path("/usr/lib/postgresql").glob("*/bin/postgres"))
     if not found:
-        pytest.skip("PostgreSQL is not installed")
+        skip("PostgreSQL is not installed")
     as_user = ["runuser", "-u", "postgres", "--"] if os.geteuid() == 0 else []
     port = free_port()
     folder = Path(tempfile.mkdtemp(prefix="linna-postgres-"))
@@ -559,14 +559,14 @@ def _create_database(server, name, template="template1"):
     return f"{server}/{name}"
 
 
-@pytest.fixture(scope="session")
+@fixture(scope="session")
 def new_postgres_database(postgres_server):
     """A function that makes an empty database on the PostgreSQL server and returns its URL."""
     numbers = itertools.count(1)
     return lambda: _create_database(postgres_server, f"empty_{next(numbers)}")
 
 
-@pytest.fixture(scope="session")
+@fixture(scope="session")
 def migrated_postgres(postgres_server):
     """A function that makes a database with the newest schema, a copy of one that was migrated; it returns the URL."""
     numbers = itertools.count(1)
@@ -574,7 +574,7 @@ def migrated_postgres(postgres_server):
     return lambda: _create_database(postgres_server, f"linna_{next(numbers)}", "migrated")
 
 
-@pytest.fixture(scope="module")
+@fixture(scope="module")
 def postgres_url(new_postgres_database):
     """URL of an empty PostgreSQL database that the tests of one module share."""
     return new_postgres_database()
@@ -590,21 +590,21 @@ class Clock:
         self.utc_ns += round(seconds * 1e9)
 
 
-@pytest.fixture
+@fixture
 def mission_time():
     made = Clock()
     set_mission_clock(lambda: made.utc_ns)
     return made
 
 
-@pytest.fixture
+@fixture
 def now(mission_time):
     """Mission time at the start of the synthetic passes."""
     mission_time.utc_ns = START
     return mission_time
 
 
-@pytest.fixture(autouse=True)
+@fixture(autouse=True)
 def wall_clock_again():
     """Let mission time be the wall clock after a test."""
     yield

@@ -6,7 +6,7 @@ import math
 import re
 import threading
 
-import pytest
+from pytest import approx, fixture, raises
 
 from ground_service.app import create_app
 from ground_service.passes.archive_import import import_archive
@@ -19,7 +19,7 @@ from tmtc.link.frames import Clcw, pack_clcw
 V1 = "/api/v1"
 
 
-@pytest.fixture(scope="module")
+@fixture(scope="module")
 def client(synthetic_pass, tmp_path_factory):
     """A service without users, with the synthetic pass in it; not to be given users."""
     settings = Settings(home=tmp_path_factory.mktemp("api"), upload_limit_mib=2)
@@ -142,7 +142,7 @@ def test_series_are_made_short_with_their_extremes(client):
     assert all(b["min"] <= b["mean"] <= b["max"] for b in buckets)
     temperature = client.get(f"{V1}/passes/1/telemetry/temperature_c").json()
     assert (temperature["unit"], temperature["samples"]) == ("degC", 40)
-    assert temperature["buckets"][-1]["max"] == pytest.approx(23.9)
+    assert temperature["buckets"][-1]["max"] == approx(23.9)
     assert is_problem(client.get(f"{V1}/passes/1/telemetry/salary"), 404)
     assert is_problem(client.get(f"{V1}/passes/1/states?estimator=nobody"), 404)
     assert is_problem(client.get(f"{V1}/passes/1/states?value=salary"), 422)
@@ -159,8 +159,8 @@ def test_a_page_gets_the_head_of_a_report_and_its_errors_made_short(client):
     for brief, full in zip(short["navigation"], whole["navigation"], strict=True):
         known = [math.hypot(*error) for error in full["error_rtn_m"] if None not in error]
         assert len(brief["time_s"]) == min(7, len(known))
-        assert min(brief["min_m"]) == pytest.approx(min(known), abs=1e-3)
-        assert max(brief["max_m"]) == pytest.approx(max(known), abs=1e-3)
+        assert min(brief["min_m"]) == approx(min(known), abs=1e-3)
+        assert max(brief["max_m"]) == approx(max(known), abs=1e-3)
         columns = ("min_m", "max_m", "mean_m", "after_gap")
         assert all(len(brief[column]) == len(brief["time_s"]) for column in columns)
     again = client.get(f"{address}/overview?max_points=7", headers={"if-none-match": answer.headers["etag"]})
@@ -311,7 +311,7 @@ def test_watching_needs_a_token_where_there_are_users(guarded):
     client, heads = guarded
     token = heads["viewer"]["Authorization"].removeprefix("Bearer ")
     for headers in ({}, {"Authorization": "Bearer wrong"}):
-        with pytest.raises(WebSocketDisconnect), client.websocket_connect(f"{V1}/live", headers=headers):
+        with raises(WebSocketDisconnect), client.websocket_connect(f"{V1}/live", headers=headers):
             pass
     with client.websocket_connect(f"{V1}/live", headers=heads["viewer"]):
         pass
@@ -388,9 +388,9 @@ def test_a_key_whose_work_was_cut_off_is_refused_and_says_why(ground):
     def cut_off():
         raise DatabaseUnavailable("db", "gone")
 
-    with pytest.raises(DatabaseUnavailable):
+    with raises(DatabaseUnavailable):
         ask(cut_off)
-    with pytest.raises(Conflict, match="begun and its end is not known"):
+    with raises(Conflict, match="begun and its end is not known"):
         ask(lambda: {"id": 1})
 
 

@@ -11,7 +11,7 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 
 import httpx
-import pytest
+from pytest import fixture, mark, raises
 
 from ground_service.app import create_app
 from ground_service.client import Client, ServiceProblem, connection
@@ -88,14 +88,14 @@ class Service:
         self.url = f"http://127.0.0.1:{self.server.server_address[1]}"
 
 
-@pytest.fixture
+@fixture
 def clock(monkeypatch):
     made = Clock()
     monkeypatch.setattr(connection, "time", made)
     return made
 
 
-@pytest.fixture
+@fixture
 def service():
     made = Service()
     yield made
@@ -104,7 +104,7 @@ def service():
     made.thread.join()
 
 
-@pytest.fixture
+@fixture
 def body(tmp_path):
     path = tmp_path / "reference.oem"
     path.write_bytes(b"octets " * 1000)
@@ -125,24 +125,24 @@ def test_an_upload_that_finds_the_service_busy_is_sent_again_whole(service, cloc
 
 def test_a_service_that_stays_busy_is_given_up_in_its_own_words(service, clock, body):
     service.answers = [(503, {"Retry-After": "600"})]
-    with pytest.raises(ServiceProblem, match="busy now") as caught:
+    with raises(ServiceProblem, match="busy now") as caught:
         Client(service.url).add_ephemeris(body)
     assert caught.value.status == 503
     assert clock.slept == [10.0] * int(BUSY_S / 10.0)  # it waits 10 s at most, however long it is asked to
 
 
-@pytest.mark.parametrize(
+@mark.parametrize(
     "answer", [(503, {}), (503, {"Retry-After": "soon"}), (500, {"Retry-After": "1"}), (409, {}), (429, {})]
 )
 def test_what_is_no_invitation_to_come_again_is_reported_at_once(service, clock, body, answer):
     service.answers = [answer]
-    with pytest.raises(ServiceProblem) as caught:
+    with raises(ServiceProblem) as caught:
         Client(service.url).add_ephemeris(body)
     assert caught.value.status == answer[0]
     assert (len(service.bodies), clock.slept) == (1, [])
 
 
-@pytest.mark.parametrize(
+@mark.parametrize(
     "call, attempts",
     [
         (lambda client: client.evaluate_pass(1), ATTEMPTS),
@@ -159,7 +159,7 @@ def test_after_a_broken_connection_only_safe_requests_and_those_with_a_key_are_r
         keys.append(request.headers.get("Idempotency-Key"))
         raise httpx.RemoteProtocolError("server disconnected")
 
-    with pytest.raises(Unreachable, match="http://ground: the connection broke: server disconnected"):
+    with raises(Unreachable, match="http://ground: the connection broke: server disconnected"):
         call(client_of(answer))
     assert len(keys) == attempts
     assert len(set(keys)) == 1  # the key stays the same, so the service processes the request once
@@ -169,7 +169,7 @@ def test_a_service_that_cannot_be_reached_is_not_asked_again(clock):
     def answer(_):
         raise httpx.ConnectError("connection refused")
 
-    with pytest.raises(Unreachable, match="http://ground: cannot be reached: connection refused"):
+    with raises(Unreachable, match="http://ground: cannot be reached: connection refused"):
         client_of(answer).evaluate_pass(1)
     assert clock.slept == []
 
@@ -187,20 +187,20 @@ KINDS = """
 """
 
 
-@pytest.mark.parametrize("status, kind", cells(KINDS))
+@mark.parametrize("status, kind", cells(KINDS))
 def test_a_refusal_is_an_exception_of_its_kind_with_the_problem_details(status, kind):
     text = f"""{{"type": "about:blank", "title": "t", "status": {status}, "detail": "window 3: no", "state": "draft",
         "new_field": 1}}"""
-    with pytest.raises(ServiceProblem) as caught:
+    with raises(ServiceProblem) as caught:
         client_of(lambda _: httpx.Response(int(status), text=text)).get_window(3)
     assert (type(caught.value).__name__, str(caught.value.status), str(caught.value)) == (kind, status, "window 3: no")
     assert caught.value.problem.state == "draft"
 
 
 def test_a_response_of_another_program_is_reported_with_the_server():
-    with pytest.raises(ServiceProblem, match="http://ground: expected JSON of a LINNA service, found other"):
+    with raises(ServiceProblem, match="http://ground: expected JSON of a LINNA service, found other"):
         client_of(lambda _: httpx.Response(200, text="<html>")).get_job("0" * 32)
-    with pytest.raises(ServiceProblem, match="404 Not Found") as caught:
+    with raises(ServiceProblem, match="404 Not Found") as caught:
         client_of(lambda _: httpx.Response(404, text="<html>")).get_job("0" * 32)
     assert caught.value.problem is None
 
@@ -209,7 +209,7 @@ def test_a_failed_job_is_an_exception_with_its_error():
     job = """{"id": "00", "kind": "ingest", "state": "failed", "progress": 0.0, "attempts": 1, "arguments": {},
         "result": null, "error": "no downlink", "created": "2029-08-07T00:00:00Z", "started": null, "finished": null,
         "traceparent": null}"""
-    with pytest.raises(JobFailed, match="no downlink"):
+    with raises(JobFailed, match="no downlink"):
         client_of(lambda _: httpx.Response(200, text=job)).wait("00")
 
 
@@ -229,7 +229,7 @@ def passes_of(total, asked):
     return answer
 
 
-@pytest.mark.parametrize("total, pages", [(0, 1), (999, 1), (1000, 1), (1001, 2), (2500, 3)])
+@mark.parametrize("total, pages", [(0, 1), (999, 1), (1000, 1), (1001, 2), (2500, 3)])
 def test_a_list_is_fetched_page_by_page_until_its_end(total, pages):
     asked = []
     client = client_of(passes_of(total, asked))
@@ -246,7 +246,7 @@ PAGES = """
 """
 
 
-@pytest.mark.parametrize("limit, expected, requests", cells(PAGES))
+@mark.parametrize("limit, expected, requests", cells(PAGES))
 def test_a_page_has_as_many_items_as_asked_for(limit, expected, requests):
     asked = []
     page = client_of(passes_of(2500, asked)).list_passes().page(int(limit))
@@ -289,7 +289,7 @@ def test_a_download_that_breaks_leaves_no_file(tmp_path, clock):
             yield b"half"
             raise httpx.ReadError("connection reset")
 
-    with pytest.raises(Unreachable):
+    with raises(Unreachable):
         client_of(lambda _: httpx.Response(200, stream=Broken())).get_report("0" * 32, tmp_path / "report.html")
     assert list(tmp_path.iterdir()) == []
 
@@ -336,7 +336,7 @@ def test_every_operation_of_the_api_has_a_method_of_its_name_with_its_path_keys_
         if operation["operationId"] in ("add_ephemeris", "upload_archive", "keep_archive", "add_build"):
             values["file"] = Path(__file__)
         result = None
-        with pytest.raises(ServiceProblem):
+        with raises(ServiceProblem):
             result = method(**values)
             list(result)  # a list sends its request when it is iterated
         request = sent[-1]

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import httpx
-import pytest
+from pytest import mark
 
 from benchmarks._servers import PostgresServer
 from ground_service.ground import open_ground
@@ -175,8 +175,8 @@ def carried(downlink, service, overlay):
     return signed.pop()
 
 
-@pytest.mark.campaign
-@pytest.mark.parametrize("kind", ["base", "objects", "provider"])
+@mark.campaign
+@mark.parametrize("kind", ["base", "objects", "provider"])
 def test_no_acknowledged_piece_is_lost_with_any_server_lost(kind, synthetic_pass, tmp_path):
     downlink = synthetic_pass.folder / "downlink.cadu"
     with open_ground(tmp_path / "reference") as ground:

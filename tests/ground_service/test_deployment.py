@@ -11,9 +11,9 @@ import time
 import tomllib
 from pathlib import Path
 
-import pytest
 import redis
 import yaml
+from pytest import mark, raises, skip
 
 from ground_service.settings import Settings
 from studies.harness.parts import Part, free_port, listens
@@ -53,7 +53,7 @@ def default_of(text):
     return re.sub(r"\$\{[A-Z_]+:-([^}]*)\}", r"\1", text)
 
 
-@pytest.mark.parametrize("name", sorted(SERVICES))
+@mark.parametrize("name", sorted(SERVICES))
 def test_every_service_is_confined(name):
     service = SERVICES[name]
     assert service["read_only"] and service["cap_drop"] == ["ALL"]
@@ -263,10 +263,8 @@ def start_script(name, secrets, folder):
     return done, written
 
 
-@pytest.mark.parametrize("is_empty", [True, False])
-@pytest.mark.parametrize(
-    "name, missing", [(name, secret) for name, (_, secrets) in HOLDERS.items() for secret in secrets]
-)
+@mark.parametrize("is_empty", [True, False])
+@mark.parametrize("name, missing", [(name, secret) for name, (_, secrets) in HOLDERS.items() for secret in secrets])
 def test_a_server_does_not_start_with_an_empty_password(name, missing, is_empty, tmp_path):
     secrets = {secret: "given" for secret in HOLDERS[name][1] if secret != missing}
     done, _ = start_script(name, secrets | ({missing: ""} if is_empty else {}), tmp_path)
@@ -286,7 +284,7 @@ def test_the_broker_grants_what_a_worker_needs_and_no_administration(tmp_path):
     """A right that is missing would be a traceback in the log of the worker every second."""
     for program in ("redis-server", "redis-cli"):
         if shutil.which(program) is None:
-            pytest.skip(f"{program} is not installed")
+            skip(f"{program} is not installed")
     (tmp_path / "broker_password").write_text("secret")
     port = free_port()
     environment = {**os.environ, "LINNA_SECRETS": str(tmp_path), "LINNA_REDIS_USERS": str(tmp_path / "users.acl")}
@@ -309,7 +307,7 @@ def test_the_broker_grants_what_a_worker_needs_and_no_administration(tmp_path):
         assert "Error" not in log.read_text()
         client = redis.Redis.from_url(url)
         for command in ("CONFIG GET dir", "FLUSHALL", "ACL LIST", "SHUTDOWN"):
-            with pytest.raises(redis.exceptions.NoPermissionError):
+            with raises(redis.exceptions.NoPermissionError):
                 client.execute_command(*command.split())
         client.close()
     finally:
@@ -317,7 +315,7 @@ def test_the_broker_grants_what_a_worker_needs_and_no_administration(tmp_path):
         broker.end()
 
 
-@pytest.mark.parametrize("name", CERTIFICATE)
+@mark.parametrize("name", CERTIFICATE)
 def test_a_certificate_without_its_key_is_refused_and_kept(name, tmp_path):
     tls = tmp_path / "tls"
     tls.mkdir()

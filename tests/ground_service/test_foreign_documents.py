@@ -6,7 +6,7 @@ import shutil
 import tracemalloc
 
 import numpy as np
-import pytest
+from pytest import mark, raises
 
 from ground_service.errors import InvalidInput
 from ground_service.missions.service import read_mission
@@ -31,18 +31,18 @@ DEEP = "a = " + "[" * 50_000 + "]" * 50_000
 LONG = "a = " + "9" * 5_000
 
 
-@pytest.mark.parametrize("text, message", [(DEEP, "nested too deeply"), (LONG, "too many digits")])
+@mark.parametrize("text, message", [(DEEP, "nested too deeply"), (LONG, "too many digits")])
 def test_toml_without_end_is_refused_in_one_line(text, message, tmp_path):
-    with pytest.raises(InvalidInput, match=message):
+    with raises(InvalidInput, match=message):
         read_mission(text.encode(), "body")
     (tmp_path / "build.toml").write_text(text)
-    with pytest.raises(InvalidInput, match=message):
+    with raises(InvalidInput, match=message):
         load_build(tmp_path / "build.toml")
-    with pytest.raises(ScenarioError, match="not TOML"):
+    with raises(ScenarioError, match="not TOML"):
         parse_scenario(text)
 
 
-@pytest.mark.parametrize(
+@mark.parametrize(
     "text, message",
     [
         ("a" + ".a" * 16 + " = 1", "a deeper or longer one"),
@@ -55,7 +55,7 @@ def test_toml_without_end_is_refused_in_one_line(text, message, tmp_path):
 )
 def test_toml_that_would_cost_much_is_not_parsed(text, message, monkeypatch):
     monkeypatch.delattr("tomllib.loads")
-    with pytest.raises(InvalidInput, match=message):
+    with raises(InvalidInput, match=message):
         read_table(text, "body", "TOML")
 
 
@@ -65,7 +65,7 @@ def test_toml_in_its_limits_is_parsed_whatever_its_strings_contain():
     assert found["b"] == "x.[" * 60_000 and found["c"] == '"' + "[" * 18
 
 
-@pytest.mark.parametrize(
+@mark.parametrize(
     "text",
     [
         "[" * 50_000, '{"stages": {"a": [' + "9" * 5_000 + "]}}", '{"stages": {"a": [1' + "0" * 400 + "]}}",
@@ -78,7 +78,7 @@ def test_costs_that_a_build_states_without_end_are_not_read(text, tmp_path):
     assert read_performance(tmp_path / "performance.json") == {"stages": {"a": [1.0]}}
     (tmp_path / "performance.json").write_text(text)
     assert read_performance(tmp_path / "performance.json") is None
-    with pytest.raises(MalformedPacket, match="expected a packet dictionary"):
+    with raises(MalformedPacket, match="expected a packet dictionary"):
         parse_dictionary(text)
 
 
@@ -90,7 +90,7 @@ def test_limits_of_a_build_are_bounded_and_belong_to_a_program(tmp_path):
 
     assert digest("") == digest("[limits]\nwall_s = 900") != digest("[limits]\nwall_s = 901")
     for name in ("wall_s", "cpu_s", "memory_mib", "file_mib", "folder_mib", "open_files", "processes"):
-        with pytest.raises(InvalidInput, match=f"limits.{name}: expected less than or equal to"):
+        with raises(InvalidInput, match=f"limits.{name}: expected less than or equal to"):
             digest(f"[limits]\n{name} = 1_000_000_000")
 
 
@@ -103,7 +103,7 @@ IMPOSSIBLE = r"""
 """
 
 
-@pytest.mark.parametrize("change, message", cells(IMPOSSIBLE))
+@mark.parametrize("change, message", cells(IMPOSSIBLE))
 def test_an_archive_with_impossible_numbers_leaves_no_pass(change, message, ground, synthetic_pass, tmp_path):
     folder, change = tmp_path / "archive", json.loads(change)
     shutil.copytree(synthetic_pass.folder, folder)
@@ -117,7 +117,7 @@ def test_an_archive_with_impossible_numbers_leaves_no_pass(change, message, grou
     else:
         manifest |= change
     (folder / "manifest.json").write_text(json.dumps(manifest))
-    with pytest.raises(InvalidInput, match=message):
+    with raises(InvalidInput, match=message):
         import_archive(ground, folder)
     assert ground.read(list_passes, PassFilter()).items == []
 
@@ -127,14 +127,14 @@ def test_ephemerides_are_limited_in_size_and_lines(monkeypatch, tmp_path):
     path.write_text("CCSDS_OEM_VERS = 2.0\n" + "COMMENT\n" * 100)
     monkeypatch.setattr(ephemeris_files, "LINES_LIMIT", 100)
     monkeypatch.setattr(ephemeris_files, "LINE_OCTETS", 1000)
-    with pytest.raises(DataFileError, match="expected at most 100 lines, found 101"):
+    with raises(DataFileError, match="expected at most 100 lines, found 101"):
         ephemeris_files.load_ephemeris(path)
     path.write_bytes(bytes(ephemeris_files.OCTETS_LIMIT + 1))
-    with pytest.raises(DataFileError, match="expected at most 96 MiB"):
+    with raises(DataFileError, match="expected at most 96 MiB"):
         ephemeris_files.load_ephemeris(path)
 
 
-@pytest.mark.parametrize("name", ["a.oem", "a.xml"])
+@mark.parametrize("name", ["a.oem", "a.xml"])
 def test_an_ephemeris_is_read_as_a_stream_with_a_limit_on_states(monkeypatch, tmp_path, name):
     """Reading takes less than twice the size of the file, and 4 MiB."""
     count = 20_000
@@ -153,5 +153,5 @@ def test_an_ephemeris_is_read_as_a_stream_with_a_limit_on_states(monkeypatch, tm
     assert len(found.segments[0].utc_ns) == count
     assert peak < 2 * size + 4 * 2**20
     monkeypatch.setattr(oem, "STATES_LIMIT", count - 1)
-    with pytest.raises(DataFileError, match="expected at most 19999 states, found more"):
+    with raises(DataFileError, match="expected at most 19999 states, found more"):
         ephemeris_files.load_ephemeris(path)

@@ -8,7 +8,7 @@ import sys
 from datetime import UTC, datetime
 from pathlib import Path
 
-import pytest
+from pytest import fixture
 
 from ground_service.app import create_app
 from ground_service.settings import Settings
@@ -17,13 +17,13 @@ from tests.serving import TestClient
 PACKAGE = "linna_generated_client"
 
 
-@pytest.fixture(scope="module")
+@fixture(scope="module")
 def service(tmp_path_factory):
     with TestClient(create_app(Settings(home=tmp_path_factory.mktemp("api")))) as opened:
         yield opened
 
 
-@pytest.fixture(scope="module")
+@fixture(scope="module")
 def generated(service, tmp_path_factory):
     folder = tmp_path_factory.mktemp("client")
     (folder / "openapi.json").write_text(json.dumps(service.get("/api/v1/openapi.json").json()))
@@ -43,7 +43,7 @@ def generated(service, tmp_path_factory):
         del sys.modules[name]
 
 
-@pytest.fixture
+@fixture
 def client(service, generated):
     made = importlib.import_module(PACKAGE).Client(base_url="http://testserver")
     return made.set_httpx_client(service)

@@ -9,10 +9,10 @@ from ast import literal_eval
 from dataclasses import replace
 from pathlib import Path
 
-import pytest
 import yaml
 from opentelemetry.sdk.trace.export.in_memory_span_exporter import InMemorySpanExporter
 from prometheus_client.parser import text_string_to_metric_families
+from pytest import MonkeyPatch, fixture, mark, raises, skip
 
 from ground_service import logs
 from ground_service.app import create_app
@@ -52,7 +52,7 @@ def expressions():
     return [rule["expr"] for rule in alerts()] + drawn
 
 
-@pytest.fixture(scope="module")
+@fixture(scope="module")
 def samples(tmp_path_factory, synthetic_pass):
     """Names of all samples of /metrics, with the names of their labels."""
     folder = tmp_path_factory.mktemp("observed")
@@ -66,7 +66,7 @@ def samples(tmp_path_factory, synthetic_pass):
     def distributed(*given):
         return replace(read_condition(*given), broker=True, runner=True, processes={"worker": 2})
 
-    with pytest.MonkeyPatch.context() as patched, TestClient(create_app(settings, inline_jobs=True)) as client:
+    with MonkeyPatch.context() as patched, TestClient(create_app(settings, inline_jobs=True)) as client:
         patched.setattr("ground_service.worker.metrics.read_condition", distributed)
         client.get("/api/v1/passes")
         text = client.get("/metrics").text
@@ -132,7 +132,7 @@ correlation_ages_s | {(76, "flight"): 18e4, (76, "replay"): 1e9} | The time corr
 """
 
 
-@pytest.mark.parametrize("name, value, said", cells(COMPLAINTS))
+@mark.parametrize("name, value, said", cells(COMPLAINTS))
 def test_the_status_names_what_has_to_be_looked_after(name, value, said):
     assert condition.complaints(GOOD) == []
     assert condition.complaints(replace(GOOD, **{name: literal_eval(value)})) == [said]
@@ -174,7 +174,7 @@ def test_prometheus_renames_no_label_of_a_metric(samples):
 def test_the_configuration_of_prometheus_is_valid_and_has_the_jobs_of_the_alerts():
     program = shutil.which("promtool")
     if program is None:
-        pytest.skip("promtool is not installed")
+        skip("promtool is not installed")
     place = RULES.with_name("prometheus.yml")
     checked = subprocess.run([program, "check", "config", str(place)], capture_output=True, text=True, check=False)
     assert checked.returncode == 0, checked.stdout + checked.stderr
@@ -248,7 +248,7 @@ def backup_tests(healthy):
 def test_alerts_fire_and_only_when_they_should(tmp_path):
     program = shutil.which("promtool")
     if program is None:
-        pytest.skip("promtool is not installed")
+        skip("promtool is not installed")
     checked = subprocess.run([program, "check", "rules", str(RULES)], capture_output=True, text=True, check=False)
     assert checked.returncode == 0, checked.stderr
     healthy = series_of(HEALTHY)
@@ -354,5 +354,5 @@ def test_spans_of_a_request_its_job_and_its_report_are_one_tree(tmp_path, synthe
 
 def test_traces_without_the_library_are_refused_with_a_remedy(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "opentelemetry.sdk.trace", None)
-    with pytest.raises(SettingsError, match="LINNA_TRACES: expected the extra 'traces'"):
+    with raises(SettingsError, match="LINNA_TRACES: expected the extra 'traces'"):
         create_app(Settings(home=tmp_path, traces="http://127.0.0.1:4318/v1/traces"))

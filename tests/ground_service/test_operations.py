@@ -6,7 +6,7 @@ import re
 from datetime import datetime, timedelta
 from pathlib import Path
 
-import pytest
+from pytest import fixture, mark
 
 from ground_service.access.service import add_user
 from ground_service.app import create_app
@@ -45,13 +45,13 @@ status telecommands telemetry time
 """)
 
 
-@pytest.fixture(scope="module")
+@fixture(scope="module")
 def client(tmp_path_factory):
     with TestClient(create_app(Settings(home=tmp_path_factory.mktemp("api")))) as opened:
         yield opened
 
 
-@pytest.fixture(scope="module")
+@fixture(scope="module")
 def operations(client):
     paths = client.get("/api/v1/openapi.json").json()["paths"]
     return [(method, path, one) for path, methods in paths.items() for method, one in methods.items()]
@@ -129,7 +129,7 @@ BAD_FIELDS = """
 """
 
 
-@pytest.mark.parametrize("change, detail", cells(BAD_FIELDS))
+@mark.parametrize("change, detail", cells(BAD_FIELDS))
 def test_a_fault_is_answered_with_what_was_expected_and_found(client, change, detail):
     given = {"name": "p", "start": "2029-08-07T06:00:00Z", "stop": "2029-08-07T06:37:00Z", "spacecraft_id": 76}
     answer = client.post("/api/v1/passes", json=given | json.loads(change))
@@ -171,7 +171,7 @@ REFUSALS = re.findall(
 )
 
 
-@pytest.fixture(scope="module")
+@fixture(scope="module")
 def shift(tmp_path_factory):
     """A service with an approved window, a released and a critical telecommand; headers of each role."""
     home = tmp_path_factory.mktemp("shift")

@@ -10,9 +10,9 @@ import sys
 import threading
 
 import httpx
-import pytest
 import uvicorn
 from pydantic import BaseModel, Field, ValidationError
+from pytest import mark, raises
 
 from ground_service.access.service import add_user
 from ground_service.app import _server, bind, create_app, serve
@@ -29,17 +29,17 @@ def test_a_port_in_use_is_one_clear_line(tmp_path):
         other.bind(("127.0.0.1", 0))
         other.listen()
         port = other.getsockname()[1]
-        with pytest.raises(ServerError, match=f"port {port}: is in use by another program; choose another with --port"):
+        with raises(ServerError, match=f"port {port}: is in use by another program; choose another with --port"):
             serve(Settings(home=tmp_path, port=port))
 
 
 def test_an_address_of_another_machine_cannot_be_bound():
-    with pytest.raises(ServerError, match="cannot be bound"):
+    with raises(ServerError, match="cannot be bound"):
         bind("192.0.2.1", 0)
 
 
 def test_binding_beyond_this_machine_needs_users(tmp_path):
-    with pytest.raises(ServerError, match=r"0\.0\.0\.0: expected users before binding beyond this machine"):
+    with raises(ServerError, match=r"0\.0\.0\.0: expected users before binding beyond this machine"):
         serve(Settings(home=tmp_path, host="0.0.0.0", port=0))
 
 
@@ -102,7 +102,7 @@ def test_a_terminated_server_drains_before_it_ends(tmp_path):
     assert ask("/readyz") == (503, "close")
     assert ask("/api/v1/missions") == (200, "close")
     running.join(60)
-    with pytest.raises(httpx.ConnectError):
+    with raises(httpx.ConnectError):
         ask("/readyz")
 
 
@@ -115,21 +115,21 @@ class Named(BaseModel):
     name: str = Field(pattern=LINE_PATTERN_JSON)
 
 
-@pytest.mark.parametrize("text", ["evening pass", "Überflug 7", "\u6708 \U0001f315", "a/b: c=1"])
+@mark.parametrize("text", ["evening pass", "Überflug 7", "\u6708 \U0001f315", "a/b: c=1"])
 def test_a_printable_line_is_taken_as_it_is(text):
     assert require_line(text, "window", "name") == Named(name=text).name == text
 
 
-@pytest.mark.parametrize("text", BAD)
+@mark.parametrize("text", BAD)
 def test_control_characters_are_refused_and_shown_by_their_codes(text):
-    with pytest.raises(InvalidInput, match="window, name: expected a line of 1 to 200 characters") as refused:
+    with raises(InvalidInput, match="window, name: expected a line of 1 to 200 characters") as refused:
         require_line(text, "window", "name")
     assert str(refused.value).isprintable()
-    with pytest.raises(ValidationError):
+    with raises(ValidationError):
         Named(name=text)
 
 
-@pytest.mark.parametrize("text", ["", "x" * 201, "\ud800", 7, None])
+@mark.parametrize("text", ["", "x" * 201, "\ud800", 7, None])
 def test_what_is_no_line_is_refused(text):
-    with pytest.raises(InvalidInput):
+    with raises(InvalidInput):
         require_line(text, "pass", "name")

@@ -1,13 +1,13 @@
 """Settings: from the environment, from files, and refused in one line."""
 
-import pytest
+from pytest import fixture, mark, raises
 
 from ground_service.errors import SettingsError
 from ground_service.settings import SECRETS, URLS, load_settings, normalised_url
 from tests.ground_service.conftest import cells
 
 
-@pytest.fixture(autouse=True)
+@fixture(autouse=True)
 def bare(monkeypatch, tmp_path):
     for name in ("HOME", "DATABASE_URL", "BROKER_URL", "HOST", "PORT", "DATABASE_URL_FILE", "BROKER_URL_FILE"):
         monkeypatch.delenv(f"LINNA_{name}", raising=False)
@@ -58,15 +58,15 @@ LINNA_DATABASE_URL_FILE | /does/not/exist | LINNA_DATABASE_URL_FILE: expected a 
 """
 
 
-@pytest.mark.parametrize("name, value, message", cells(WRONG))
+@mark.parametrize("name, value, message", cells(WRONG))
 def test_a_wrong_setting_is_named(monkeypatch, name, value, message):
     monkeypatch.setenv(name, value)
-    with pytest.raises(SettingsError, match=message):
+    with raises(SettingsError, match=message):
         load_settings()
 
 
-@pytest.mark.parametrize("name", [*URLS, *SECRETS, "database_password", "broker_password"])
-@pytest.mark.parametrize(
+@mark.parametrize("name", [*URLS, *SECRETS, "database_password", "broker_password"])
+@mark.parametrize(
     "octets, message",
     [
         (b"", "expected a file with a value, found an empty file"),
@@ -83,15 +83,15 @@ def test_an_unusable_secret_is_refused_in_one_line_and_never_replaced_by_a_defau
     monkeypatch.setenv("LINNA_BROKER_URL", "redis://linna@broker:6379/0")
     if name == "database_password":
         monkeypatch.setenv("LINNA_DATABASE_URL", "postgresql://linna@db/linna")
-    with pytest.raises(SettingsError, match=f"^LINNA_{name.upper()}_FILE: {message}") as error:
+    with raises(SettingsError, match=f"^LINNA_{name.upper()}_FILE: {message}") as error:
         load_settings()
     assert str(tmp_path / "secret") in str(error.value) and "\n" not in str(error.value)
 
 
-@pytest.mark.parametrize("url", ["nonsense", "amqp://linna:geheim@broker/0", "redis://", "//linna:geheim@broker"])
+@mark.parametrize("url", ["nonsense", "amqp://linna:geheim@broker/0", "redis://", "//linna:geheim@broker"])
 def test_a_broker_other_than_redis_is_refused_without_showing_its_password(monkeypatch, url):
     monkeypatch.setenv("LINNA_BROKER_URL", url)
-    with pytest.raises(SettingsError) as error:
+    with raises(SettingsError) as error:
         load_settings()
     expected = "LINNA_BROKER_URL: expected a URL such as redis://host:6379/0, found another one"
     assert str(error.value) == expected
@@ -101,13 +101,13 @@ def test_a_password_without_a_user_is_refused(monkeypatch, tmp_path):
     (tmp_path / "password").write_text("geheim")
     monkeypatch.setenv("LINNA_BROKER_PASSWORD_FILE", str(tmp_path / "password"))
     monkeypatch.setenv("LINNA_BROKER_URL", "redis://broker:6379/0")
-    with pytest.raises(SettingsError, match="LINNA_BROKER_URL: expected a URL with a user") as error:
+    with raises(SettingsError, match="LINNA_BROKER_URL: expected a URL with a user") as error:
         load_settings()
     assert "geheim" not in str(error.value)
     monkeypatch.setenv("LINNA_BROKER_URL", "redis://:other@broker:6379/0")
     assert load_settings().resolved_broker_url() == "redis://:other@broker:6379/0"
 
 
-@pytest.mark.parametrize("spelling", ["postgres://h/d", "postgresql://h/d", "postgresql+psycopg://h/d"])
+@mark.parametrize("spelling", ["postgres://h/d", "postgresql://h/d", "postgresql+psycopg://h/d"])
 def test_the_installed_driver_is_used_whatever_the_spelling(spelling):
     assert normalised_url(spelling) == "postgresql+psycopg://h/d"

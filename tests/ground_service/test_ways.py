@@ -7,7 +7,7 @@ import threading
 import zlib
 
 import numpy as np
-import pytest
+from pytest import fixture
 
 from ground_service.evaluation.core import summary_of
 from ground_service.evaluation.service import evaluate
@@ -109,14 +109,14 @@ def of_kind(name, packets):
     return found
 
 
-@pytest.fixture(scope="module")
+@fixture(scope="module")
 def archive(tmp_path_factory):
     folder = tmp_path_factory.mktemp("ways") / "archive"
     emulate(parse_scenario(SCENARIO), NO_DATA, folder, frames_kept=None)
     return folder
 
 
-@pytest.fixture(scope="module")
+@fixture(scope="module")
 def ways(archive, tmp_path_factory):
     """Return the packets of each way."""
     world = build_world(parse_scenario(SCENARIO), NO_DATA)

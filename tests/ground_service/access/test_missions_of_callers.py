@@ -4,8 +4,8 @@ import re
 from dataclasses import dataclass
 from types import SimpleNamespace
 
-import pytest
 from fastapi.routing import APIRoute
+from pytest import fixture, mark, raises
 from sqlalchemy import BigInteger, Float, Integer, LargeBinary, SmallInteger, func, select, update
 from starlette.datastructures import QueryParams
 
@@ -102,7 +102,7 @@ def row_of(connection, table, **given):
     repository.add(connection, table, **{one.name: dummy(one) for one in needed}, **given)
 
 
-@pytest.fixture(scope="module")
+@fixture(scope="module")
 def fleet(tmp_path_factory):
     settings = Settings(home=tmp_path_factory.mktemp("fleet"), links=False, plan_hourly=False)
     with TestClient(create_app(settings, inline_jobs=True)) as client:
@@ -142,7 +142,7 @@ def test_every_decision_is_that_of_an_operation():
     assert [one for found in DECIDED.values() for one in found if one not in names] == []
 
 
-@pytest.mark.parametrize("route", CHECKED, ids=NAMES)
+@mark.parametrize("route", CHECKED, ids=NAMES)
 def test_an_operation_reaches_only_spacecraft_of_the_callers_missions(route, fleet):
     scope = scope_of(route)
     assert scope is not None, "decide in ground_service/access/scopes.py which spacecraft it concerns"
@@ -164,13 +164,13 @@ def test_an_operation_reaches_only_spacecraft_of_the_callers_missions(route, fle
     )  # fmt: skip
     for caller in (Caller("eve", "viewer"), fleet.theirs):
         if scope.decision == "service" and caller.missions is not None:
-            with pytest.raises(Forbidden, match="found an operation of the whole service"):
+            with raises(Forbidden, match="found an operation of the whole service"):
                 check_scope(asked, caller)
         else:
             check_scope(asked, caller)
 
 
-@pytest.mark.parametrize("name", sorted(DECIDED["list"]))
+@mark.parametrize("name", sorted(DECIDED["list"]))
 def test_a_list_leaves_out_other_spacecraft(name, fleet):
     (route,) = (one for one in CHECKED if one.name == name)
     answer = fleet.client.get(route.path, headers=fleet.headers)
@@ -185,7 +185,7 @@ def test_an_operation_without_a_decision_and_a_spacecraft_that_is_not_stated_are
     route = APIRoute("/new", new)
     assert scope_of(route) is None
     asked = SimpleNamespace(scope={"route": route})
-    with pytest.raises(Forbidden, match="operation of the whole service"):
+    with raises(Forbidden, match="operation of the whole service"):
         check_scope(asked, fleet.ours)
     answer = fleet.client.post(f"{V1}/telemetry", content=b"x", headers=fleet.headers)
     assert answer.status_code == 403
@@ -262,7 +262,7 @@ def test_a_socket_sends_only_events_of_the_callers_spacecraft(fleet):
         assert socket.receive_json()["payload"]["mission"] == "ours"
 
 
-@pytest.mark.parametrize(
+@mark.parametrize(
     "event",
     [
         WindowChanged(id=1, state="approved"), CommandStateChanged(id=1, state="sent"),
@@ -283,7 +283,7 @@ def test_a_scope_names_its_parameter():
 OWN = {"Origin": "http://testserver"}
 
 
-@pytest.fixture
+@fixture
 def token(client):
     return users.add_user(client.app.state.ground, "ann", "operator")
 
@@ -369,7 +369,7 @@ def test_a_change_with_the_cookie_from_another_origin_is_refused(client, token):
     assert client.post("/api/v1/windows", json={}, headers=OWN).status_code == 422
 
 
-@pytest.fixture
+@fixture
 def openmct(tmp_path):
     """A folder with the files of the npm package that the service reads."""
     folder = tmp_path / "openmct"
@@ -395,7 +395,7 @@ def test_the_displays_open_with_a_session_only(tmp_path, openmct):
         assert client.get("/mct/4.2.0/secret.env").status_code == 404
 
 
-@pytest.mark.parametrize("missing", ["package.json", "LICENSE.md", "dist/openmct.js"])
+@mark.parametrize("missing", ["package.json", "LICENSE.md", "dist/openmct.js"])
 def test_an_incomplete_installation_counts_as_none(tmp_path, openmct, missing):
     (openmct / missing).unlink()
     settings = Settings(home=tmp_path / "home", openmct=openmct)
@@ -437,7 +437,7 @@ BODIES = r"""
 """
 
 
-@pytest.mark.parametrize("body", BODIES.strip().splitlines())
+@mark.parametrize("body", BODIES.strip().splitlines())
 def test_a_user_that_cannot_be_added_is_refused(guarded, body):
     client, heads = guarded
     assert (

@@ -8,8 +8,8 @@ import time
 from datetime import UTC, datetime
 from urllib.parse import parse_qs, urlsplit
 
-import pytest
 from joserfc import jwk
+from pytest import fixture, mark, raises
 
 from ground_service.access import provider as oidc
 from ground_service.access import service as users
@@ -28,7 +28,7 @@ OWN = {"Origin": "http://testserver"}
 ROLES = ("admin=linna-admins", "operator=linna-operators", "viewer=linna-viewers")
 
 
-@pytest.fixture
+@fixture
 def provider():
     with running_provider() as running:
         yield running
@@ -41,14 +41,14 @@ def settings(home, provider, **given):
     )  # fmt: skip
 
 
-@pytest.fixture
+@fixture
 def client(tmp_path, provider):
     app = create_app(settings(tmp_path, provider), inline_jobs=True)
     with TestClient(app, follow_redirects=False) as opened:
         yield opened
 
 
-@pytest.fixture
+@fixture
 def ground(client):
     return client.app.state.ground
 
@@ -158,7 +158,7 @@ def test_a_token_of_another_key_is_refused(client, provider):
     refused(answered(client, provider), "a signature of a key of the provider")
 
 
-@pytest.mark.parametrize("algorithm", ["none", "HS256"])
+@mark.parametrize("algorithm", ["none", "HS256"])
 def test_a_token_without_an_asymmetric_signature_is_refused(client, provider, algorithm, monkeypatch):
     """With HS256, the public key of the provider could be used as the secret."""
 
@@ -344,7 +344,7 @@ def test_a_provider_that_is_down_is_no_traceback_and_tokens_still_work(tmp_path)
         assert client.get("/sign-in/ended", params={"next": "//evil.example"}).headers["location"] == "/"
 
 
-@pytest.mark.parametrize(
+@mark.parametrize(
     "metadata", [{"issuer": "https://evil.example"}, {"token_endpoint": None}, {"jwks_uri": "http://127.0.0.1:1/keys"}]
 )
 def test_a_provider_whose_configuration_is_wrong_cannot_be_used(client, provider, metadata):
@@ -378,7 +378,7 @@ def sign_out(client, token):
     return status
 
 
-@pytest.mark.parametrize("change", [{}, {"sub": None}, {"sid": None}])
+@mark.parametrize("change", [{}, {"sub": None}, {"sid": None}])
 def test_the_provider_ends_the_session(client, ground, provider, change):
     answered(client, provider)
     secret = client.cookies[SESSION_COOKIE]
@@ -439,9 +439,9 @@ INCOMPLETE = """
 """
 
 
-@pytest.mark.parametrize("given, word", cells(INCOMPLETE))
+@mark.parametrize("given, word", cells(INCOMPLETE))
 def test_incomplete_settings_are_refused_at_the_start(tmp_path, provider, given, word):
-    with pytest.raises(SettingsError, match=word):
+    with raises(SettingsError, match=word):
         create_app(settings(tmp_path, provider).model_copy(update=json.loads(given)))
 
 
@@ -455,10 +455,10 @@ OBJECTS_ENDPOINT | 127.0.0.1:9000 | LINNA_OBJECTS_ENDPOINT
 """
 
 
-@pytest.mark.parametrize("name, value, word", cells(WRONG))
+@mark.parametrize("name, value, word", cells(WRONG))
 def test_wrong_settings_are_one_line(monkeypatch, name, value, word):
     monkeypatch.setenv(f"LINNA_{name}", value)
-    with pytest.raises(SettingsError, match=word):
+    with raises(SettingsError, match=word):
         load_settings()
 
 
@@ -471,5 +471,5 @@ def test_the_secret_may_be_a_file(monkeypatch, tmp_path):
 
 def test_the_role_of_a_user_of_the_provider_is_not_changed_here(client, ground, provider):
     answered(client, provider)
-    with pytest.raises(Conflict, match="states the role"):
+    with raises(Conflict, match="states the role"):
         users.change_user(ground, "ann", role="admin")

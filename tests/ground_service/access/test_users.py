@@ -4,7 +4,7 @@ import threading
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import nullcontext
 
-import pytest
+from pytest import fixture, mark, raises
 
 from ground_service.access.model import AuditFilter
 from ground_service.access.service import (
@@ -41,10 +41,10 @@ def test_a_disabled_user_is_refused_at_once_in_every_process(either, tmp_path):
         assert authenticate(other, token).name == "bob"
         assert token_valid(other, token)
         assert change_user(either, "bob", state="disabled", actor="ann").state == "disabled"
-        with pytest.raises(NotAuthorised, match="user bob is disabled"):
+        with raises(NotAuthorised, match="user bob is disabled"):
             authenticate(other, token)
         assert not token_valid(other, token)
-        with pytest.raises(Conflict, match="user bob: expected state active, found disabled"):
+        with raises(Conflict, match="user bob: expected state active, found disabled"):
             change_user(other, "bob", state="disabled")
         change_user(other, "bob", state="active")
         assert authenticate(either, token).role == "operator"
@@ -58,13 +58,13 @@ def test_a_revoked_token_is_refused_and_others_stay(either):
     assert (oldest.expires, newest.state) == (None, "active")
     assert first not in str(newest) + str(oldest)
     assert revoke_token(either, oldest.id, actor="eve").state == "revoked"
-    with pytest.raises(NotAuthorised):
+    with raises(NotAuthorised):
         authenticate(either, first)
     assert not token_valid(either, first) and token_valid(either, second)
     assert authenticate(either, second).token_id == newest.id
-    with pytest.raises(Conflict, match=f"token {oldest.id}: expected state active, found revoked"):
+    with raises(Conflict, match=f"token {oldest.id}: expected state active, found revoked"):
         revoke_token(either, oldest.id)
-    with pytest.raises(NotFound):
+    with raises(NotFound):
         revoke_token(either, 99)
     third = add_token(either, "ann", revoke_others=True)
     assert [token_valid(either, one) for one in (first, second, third)] == [False, False, True]
@@ -75,12 +75,12 @@ def test_the_last_administrator_stays(either):
         add_user(either, name, "admin")
     change_user(either, "bob", role="viewer")
     for change in ({"state": "disabled"}, {"role": "operator"}):
-        with pytest.raises(Conflict, match="user ann: expected another active administrator, found none"):
+        with raises(Conflict, match="user ann: expected another active administrator, found none"):
             change_user(either, "ann", **change)
     assert get_user(either, "ann").role == "admin"
     change_user(either, "bob", state="disabled")
     change_user(either, "bob", role="admin")
-    with pytest.raises(Conflict, match="another active administrator"):
+    with raises(Conflict, match="another active administrator"):
         change_user(either, "ann", state="disabled")
 
 
@@ -121,17 +121,17 @@ def test_of_several_who_add_one_user_or_revoke_one_token_one_wins(either):
     assert sum(isinstance(one, Conflict) for one in results) == 3, results
 
 
-@pytest.mark.parametrize("name", ["", "a\nb", "a\x1b[31m", "a b", "ann\n", "é", "local", "x" * 65, "-a"])
+@mark.parametrize("name", ["", "a\nb", "a\x1b[31m", "a b", "ann\n", "é", "local", "x" * 65, "-a"])
 def test_a_name_that_cannot_be_used_is_refused_in_one_line(ground, name):
-    with pytest.raises(InvalidInput) as caught:
+    with raises(InvalidInput) as caught:
         add_user(ground, name, "viewer")
     assert "\n" not in str(caught.value) and "\x1b" not in str(caught.value)
     assert list_users(ground) == []
 
 
-@pytest.mark.parametrize("days", [0.0, -1.0, float("nan"), float("inf"), 36_500.001, True])
+@mark.parametrize("days", [0.0, -1.0, float("nan"), float("inf"), 36_500.001, True])
 def test_a_validity_that_cannot_be_used_is_refused(ground, days):
-    with pytest.raises(InvalidInput, match="days valid"):
+    with raises(InvalidInput, match="days valid"):
         add_user(ground, "ann", "viewer", days_valid=days)
     assert list_users(ground) == []
 
@@ -142,7 +142,7 @@ def test_a_deployment_does_not_enable_a_disabled_user_again(ground):
     assert list_tokens(ground)[0].hint == SECRET[:4]
     add_user(ground, "bob", "admin")
     change_user(ground, "ann", state="disabled")
-    with pytest.raises(Conflict, match="expected state active, found disabled"):
+    with raises(Conflict, match="expected state active, found disabled"):
         ensure_user(ground, "ann", "admin", SECRET)
     assert not token_valid(ground, SECRET)
 
@@ -151,7 +151,7 @@ HOUR_NS = 3_600_000_000_000
 NOW = 500_000 * HOUR_NS + 1_234_567_890
 
 
-@pytest.fixture
+@fixture
 def clock(monkeypatch):
     """A clock that stands at `NOW` until it is set."""
 
@@ -219,7 +219,7 @@ def test_a_token_is_shown_with_its_times_and_valid_up_to_its_last_instant(ground
     assert list_tokens(ground)[0].state == "active"
     clock(end)
     assert not token_valid(ground, token) and list_tokens(ground)[0].state == "expired"
-    with pytest.raises(NotAuthorised, match="has expired"):
+    with raises(NotAuthorised, match="has expired"):
         authenticate(ground, token)
     clock(end + HOUR_NS)
     assert revoke_token(ground, 1).revoked == "2027-01-17T09:00:01.234567Z"
@@ -233,9 +233,9 @@ def test_further_tokens_expire_too(ground, clock):
     assert list_tokens(ground)[0].expires == "2027-01-15T20:00:01.234567Z"
     clock(NOW + 12 * HOUR_NS)
     assert not token_valid(ground, token)
-    with pytest.raises(InvalidInput, match=r"^token, days valid: expected more than 0, at most 36500, found -1"):
+    with raises(InvalidInput, match=r"^token, days valid: expected more than 0, at most 36500, found -1"):
         add_token(ground, "ann", days_valid=-1)
-    with pytest.raises(NotFound):
+    with raises(NotFound):
         add_token(ground, "bob")
 
 
@@ -268,7 +268,7 @@ def test_only_the_token_itself_is_accepted(ground):
     token = add_user(ground, "ann", "viewer")
     for other in ("", token[:-1], token + " ", token.upper(), token_sha256(token)):
         assert not token_valid(ground, other)
-        with pytest.raises(NotAuthorised, match="expected one that 'linna user add' gave out, found another"):
+        with raises(NotAuthorised, match="expected one that 'linna user add' gave out, found another"):
             authenticate(ground, other)
     # SHA-256 of "abc", FIPS 180-4.
     assert token_sha256("abc") == "ba7816bf8f01cfea414140de5dae2223b00361a396177a9cb410ff61f20015ad"
@@ -296,26 +296,26 @@ def test_a_deployment_may_change_the_role_and_keep_the_token(ground):
 def test_a_deployment_does_not_bring_a_revoked_token_back(ground):
     ensure_user(ground, "ann", "viewer", SECRET)
     revoke_token(ground, 1)
-    with pytest.raises(Conflict, match="user ann: expected a token in force, found one that was revoked"):
+    with raises(Conflict, match="user ann: expected a token in force, found one that was revoked"):
         ensure_user(ground, "ann", "viewer", SECRET)
     assert not token_valid(ground, SECRET)
 
 
-@pytest.mark.parametrize("exists", [True, False])
+@mark.parametrize("exists", [True, False])
 def test_two_users_of_a_deployment_have_tokens_of_their_own(ground, exists):
     ensure_user(ground, "ann", "viewer", SECRET)
     if exists:
         add_user(ground, "bob", "viewer")
-    with pytest.raises(Conflict, match="user bob: expected a unique token, found that of another user"):
+    with raises(Conflict, match="user bob: expected a unique token, found that of another user"):
         ensure_user(ground, "bob", "admin", SECRET)
     assert authenticate(ground, SECRET).name == "ann"
     assert [one.name for one in list_users(ground)] == (["ann", "bob"] if exists else ["ann"])
     assert all(one.role == "viewer" for one in list_users(ground))
 
 
-@pytest.mark.parametrize("length", [23, 24])
+@mark.parametrize("length", [23, 24])
 def test_a_token_of_a_deployment_has_24_characters_or_more(ground, length):
-    refused = pytest.raises(InvalidInput, match="token: expected 24 characters or more, found 23")
+    refused = raises(InvalidInput, match="token: expected 24 characters or more, found 23")
     with refused if length == 23 else nullcontext():
         assert ensure_user(ground, "ann", "viewer", "t" * length)
     assert bool(list_users(ground)) == (length == 24)
@@ -323,19 +323,19 @@ def test_a_token_of_a_deployment_has_24_characters_or_more(ground, length):
 
 def test_changes_that_cannot_be_made_are_refused_with_what_was_expected(ground):
     add_user(ground, "ann", "admin")
-    with pytest.raises(Conflict, match="user ann: exists already"):
+    with raises(Conflict, match="user ann: exists already"):
         add_user(ground, "ann", "viewer")
     for change, message in (
         ({}, "user, ann: expected a new state, role or missions, found none of them"),
         ({"state": "asleep"}, "user, state: expected active or disabled, found 'asleep'"),
         ({"role": "root"}, "user, role: expected viewer, operator, admin, found 'root'"),
     ):
-        with pytest.raises(InvalidInput, match=f"^{message}$"):
+        with raises(InvalidInput, match=f"^{message}$"):
             change_user(ground, "ann", **change)
     for work in (lambda: change_user(ground, "bob", state="disabled"), lambda: get_user(ground, "bob")):
-        with pytest.raises(NotFound, match="bob"):
+        with raises(NotFound, match="bob"):
             work()
-    with pytest.raises(InvalidInput, match=r"^user, name: .*service"):
+    with raises(InvalidInput, match=r"^user, name: .*service"):
         change_user(ground, "service", role="viewer")
 
 
@@ -348,7 +348,7 @@ def test_users_are_listed_by_name_and_tokens_newest_first(ground):
     assert [one.name for one in list_users(ground)] == ["ann", "bob", "cleo"]
     assert " ".join(f"{one.id} {one.user}" for one in list_tokens(ground)) == "4 ann 3 bob 2 ann 1 cleo"
     assert [one.id for one in list_tokens(ground, "ann")] == [4, 2]
-    with pytest.raises(NotFound):
+    with raises(NotFound):
         list_tokens(ground, "eve")
 
 

@@ -4,8 +4,8 @@ import math
 from dataclasses import replace
 
 import numpy as np
-import pytest
 from numpy.testing import assert_allclose, assert_array_equal
+from pytest import approx, mark
 
 from ground_service.evaluation.alignment import (
     ReferenceStates,
@@ -113,9 +113,9 @@ def test_an_error_of_position_is_estimate_minus_reference_and_its_place_is_found
     position = track.position_icrf_m + np.array([[5.0, 7.0, 11.0]])
     assert_allclose(error_of_positions_rtn_m(track, position), [[5.0, 11.0, -7.0]], atol=1e-6)
     latitude, longitude, altitude = places_of_positions(track, np.array([[0.0, -2e6, 0.0]]))
-    assert (latitude[0], longitude[0], altitude[0]) == pytest.approx((0.0, 270.0, 2e6 - MOON_M))
+    assert (latitude[0], longitude[0], altitude[0]) == approx((0.0, 270.0, 2e6 - MOON_M))
     longitude = places_of_positions(flown(600.0), np.array([[2e6, 0.0, 0.0]]))[1]
-    assert longitude[0] == pytest.approx(360.0 - math.degrees(0.06))
+    assert longitude[0] == approx(360.0 - math.degrees(0.06))
 
 
 def test_the_ground_path_is_the_arc_over_the_moon_that_does_not_turn_back_also_a_quarter_round():
@@ -131,7 +131,7 @@ def test_the_ground_path_is_the_arc_over_the_moon_that_does_not_turn_back_also_a
     assert_allclose(ground_path_m(track, 2.0), [0.0, math.pi, 3.0 * math.pi])
 
 
-@pytest.mark.parametrize("angle_deg", [0.0, 50.0, 130.0])
+@mark.parametrize("angle_deg", [0.0, 50.0, 130.0])
 def test_the_angle_of_the_track_with_the_meridian_is_that_of_the_velocity(angle_deg):
     states = flown(10.0, 60.0)
     angle = math.radians(angle_deg)
@@ -139,4 +139,4 @@ def test_the_angle_of_the_track_with_the_meridian_is_that_of_the_velocity(angle_
     normal *= SPEED_M_S / np.linalg.norm(normal, axis=1, keepdims=True)
     turned = math.cos(angle) * states.velocity_icrf_m_s + math.sin(angle) * normal
     found = angle_from_meridian_deg(replace(states, velocity_icrf_m_s=turned))
-    assert found == pytest.approx(min(angle_deg, 180.0 - angle_deg), abs=1e-6)
+    assert found == approx(min(angle_deg, 180.0 - angle_deg), abs=1e-6)

@@ -3,8 +3,8 @@
 import math
 
 import numpy as np
-import pytest
 from numpy.testing import assert_allclose
+from pytest import mark, raises
 from scipy.integrate import solve_ivp
 
 from ground_service.evaluation.smoother import BASELINE_DEGREE, StartState, propagated_positions
@@ -69,12 +69,12 @@ def integrated(j2=J2, bodies=()):
     return np.array(found.y[:3].T)
 
 
-@pytest.mark.parametrize("degree", [0, 1])
+@mark.parametrize("degree", [0, 1])
 def test_a_field_is_not_flown_past_the_degree_that_is_asked_for(degree):
     assert_allclose(flown(degree, third_bodies=False), circle(), atol=0.01)
 
 
-@pytest.mark.parametrize("degree", [2, 50])
+@mark.parametrize("degree", [2, 50])
 def test_a_field_is_flown_to_the_degree_that_it_has(degree):
     found = flown(degree, third_bodies=False)
     assert_allclose(found, integrated(), atol=0.05)
@@ -97,7 +97,7 @@ def test_samples_before_the_start_have_no_position_and_an_orbit_that_meets_the_g
     none = propagated_positions(START, TIMES - 10**13, oblate(), 0, Still())
     assert none.shape == (4, 3) and np.isnan(none).all()
     falling = StartState(EPOCH, START.position_icrf_m, 0.9 * START.velocity_icrf_m_s)
-    with pytest.raises(ImpactError):
+    with raises(ImpactError):
         propagated_positions(falling, TIMES, oblate(), 0, Still(), third_bodies=False)
 
 

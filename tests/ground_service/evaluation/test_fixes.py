@@ -4,8 +4,7 @@ import math
 from dataclasses import replace
 
 import numpy as np
-import pytest
-from pytest import approx
+from pytest import approx, mark
 
 from ground_service.evaluation.fixes import (
     FIRST_LANDMARK_ID,
@@ -66,7 +65,7 @@ def test_a_frame_gives_its_position_back_with_the_noise_of_a_pixel_and_not_from_
     assert np.isfinite(solved[1]).all()
 
 
-@pytest.mark.parametrize(("swapped", "expected"), [(0, 0), (3, 0), (4, 1), (8, 1)])
+@mark.parametrize("swapped, expected", [(0, 0), (3, 0), (4, 1), (8, 1)])
 def test_a_fix_is_wrong_when_half_of_its_identifications_are(swapped, expected):
     found = pairs()
     moved = found.uv_px.copy()
@@ -75,7 +74,7 @@ def test_a_fix_is_wrong_when_half_of_its_identifications_are(swapped, expected):
     assert wrong_fixes(found, CAMERA, UTC_NS, POSITION) == expected
 
 
-@pytest.mark.parametrize("frame", [0, 1])
+@mark.parametrize("frame", [0, 1])
 def test_a_wrong_fix_counts_in_whichever_frame_it_is(frame):
     found = pairs()
     moved = found.uv_px + np.where(found.frame == frame, 30.0, 0.0)[:, None]
@@ -88,9 +87,7 @@ def test_a_wrong_fix_counts_in_whichever_frame_it_is(frame):
     assert wrong_fixes(found, CAMERA, UTC_NS, lost) == 0
 
 
-@pytest.mark.parametrize(
-    ("offset_px", "diameter_px", "wrong"), [(4.9, 20.0, 0), (5.1, 20.0, 1), (9.9, 100.0, 0), (10.1, 100.0, 1)]
-)
+@mark.parametrize("offset_px, diameter_px, wrong", [(4.9, 20.0, 0), (5.1, 20.0, 1), (9.9, 100.0, 0), (10.1, 100.0, 1)])
 def test_an_identification_is_right_within_half_a_radius_and_ten_pixels(offset_px, diameter_px, wrong):
     found = pairs()
     moved = found.uv_px + np.array([offset_px, 0.0]) * (found.frame == 0)[:, None]

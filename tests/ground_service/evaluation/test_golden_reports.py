@@ -4,8 +4,7 @@ import math
 from dataclasses import replace
 
 import numpy as np
-import pytest
-from pytest import approx
+from pytest import approx, fixture, mark
 
 from ground_service.evaluation.core import summary_of
 from ground_service.evaluation.inputs import load_pass_inputs
@@ -50,7 +49,7 @@ def statuses(report):
     return {key: one.status for key, one in rows(report).items() if one.status != "not judged"}
 
 
-@pytest.fixture
+@fixture
 def made(make_pass):
     """Make a pass of twelve frames with the mission description."""
 
@@ -60,7 +59,7 @@ def made(make_pass):
     return make
 
 
-@pytest.fixture
+@fixture
 def report_on(ground):
     return lambda made: evaluate(ground, import_archive(ground, made.folder))
 
@@ -102,8 +101,8 @@ def test_a_whole_pass(made, report_on, undrawn_figures, monkeypatch):
     assert [(one["key"], one["status"]) for one in stored] == [(k, one.status) for k, one in table.items()]
 
 
-@pytest.mark.parametrize(
-    ("seen_frames", "level"),
+@mark.parametrize(
+    "seen_frames, level",
     [(0, "3 (real terrain never"), (8, "3s (real terrain seen in training; 33 %"), (FRAMES, "3s (real terrain seen")],
 )
 def test_the_share_over_unseen_terrain_is_that_of_the_frames_of_the_pass(made, report_on, seen_frames, level):
@@ -284,7 +283,7 @@ def test_a_tilted_camera_with_a_lens(made, report_on):
     assert report_on(other).detector.micro.recall < 0.2
 
 
-@pytest.mark.parametrize(("nis", "mean", "status"), [(10.0, 1.0, "met"), (100.0, 10.0, "not met")])
+@mark.parametrize("nis, mean, status", [(10.0, 1.0, "met"), (100.0, 10.0, "not met")])
 def test_an_overconfident_filter(made, report_on, nis, mean, status):
     """Five craters give ten degrees of freedom."""
     mission = MISSION.replace('"spherical"', '"anchored"').replace(

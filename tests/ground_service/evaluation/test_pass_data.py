@@ -7,8 +7,7 @@ import shutil
 from pathlib import Path
 
 import numpy as np
-import pytest
-from pytest import raises
+from pytest import fixture, mark, raises
 
 from ground_service.client.connection import NotFound as NotFoundThere
 from ground_service.client.connection import ServiceProblem
@@ -83,7 +82,7 @@ def test_a_pass_of_a_spacecraft_without_a_mission_description_says_so_and_how_to
     assert table["completeness.packets"] in ("met", "unknown") and table["detector.recall"] == "not judged"
 
 
-@pytest.mark.parametrize("stated", [b"", b"[observation]\nneeds_daylight = false\n"])
+@mark.parametrize("stated", [b"", b"[observation]\nneeds_daylight = false\n"])
 def test_the_sun_of_images_is_unknown_where_a_simulated_world_draws_its_light(synthetic_pass, ground, stated):
     add_mission(ground, MISSION_76 + stated)
     ingest_file(ground, synthetic_pass.folder / "downlink.cadu")
@@ -196,8 +195,8 @@ def test_attitudes_are_not_interpolated_over_a_gap():
     assert viewing.known(asked).tolist() == [False, True, True, False, True, False]
 
 
-@pytest.mark.parametrize(
-    ("fields", "message"),
+@mark.parametrize(
+    "fields, message",
     [
         ({"frame_b": "SC_BODY_1"}, "expected REF_FRAME_A = ICRF and REF_FRAME_B = .*, found ICRF and SC_BODY_1"),
         ({"frame_a": "LVLH"}, "found LVLH and INSTRUMENT_1"),
@@ -222,8 +221,8 @@ ROWS = ("5,2,0,0,0", "5,nan,0,0,0", "-1,1,0,0,0", "x,1,0,0,0")
 UNREADABLE = "expected on-board ticks and a unit quaternion"
 
 
-@pytest.mark.parametrize(
-    ("text", "message"),
+@mark.parametrize(
+    "text, message",
     [
         ("CCSDS_AEM_VERS = 9", ": expected a CCSDS AEM, found line 1: expected an AEM version out of 1.0, 2.0"),
         ("", ", line 1: expected image_ticks,q_w"),
@@ -242,7 +241,7 @@ def test_a_table_of_attitudes_that_cannot_be_is_refused(tmp_path, text, message)
 FRAMES = 40
 
 
-@pytest.fixture(scope="module")
+@fixture(scope="module")
 def imported(synthetic_pass, tmp_path_factory):
     with open_ground(tmp_path_factory.mktemp("imported") / "home") as ground:
         pass_id = import_archive(ground, synthetic_pass.folder)
@@ -315,16 +314,16 @@ def test_a_report_is_made_in_process_without_http(imported, tmp_path, monkeypatc
         assert client.get_job(key).state == "done"
         patched.undo()
         for ask in (client.make_report, client.get_job, client.get_report_summary):
-            with pytest.raises(ServiceProblem, match=r"expected|String should match"):
+            with raises(ServiceProblem, match=r"expected|String should match"):
                 ask(-1)
-        with pytest.raises(NotFoundThere, match=f"report {'0' * 32}: not found"):
+        with raises(NotFoundThere, match=f"report {'0' * 32}: not found"):
             client.get_report("0" * 32, tmp_path / "none")
     assert sorted(file.name for file in tmp_path.iterdir()) == ["report.html", "report.json", "report.pdf"]
     assert (tmp_path / "report.pdf").read_bytes() == report_document(ground, key, "pdf") == b"%PDF-"
 
 
-@pytest.mark.parametrize(
-    ("change", "message"),
+@mark.parametrize(
+    "change, message",
     [
         ({"start_utc": None}, "start_utc: expected str, found None"),
         ({"stop_utc": "yesterday"}, "expected UTC epochs"),
@@ -344,14 +343,14 @@ def test_a_wrong_manifest_is_refused_and_nothing_is_stored(synthetic_pass, groun
         else:
             manifest[key] = value
     (folder / "manifest.json").write_text(json.dumps(manifest))
-    with pytest.raises(InvalidInput, match=message):
+    with raises(InvalidInput, match=message):
         import_archive(ground, folder)
     for table in (repository.PASSES, repository.FILES):
         assert ground.read(repository.newest, table, Paging())[1] == 0
 
 
 def test_no_archive_and_no_pass_are_refused(ground, tmp_path):
-    with pytest.raises(InvalidInput, match=r"expected a pass archive with manifest.json"):
+    with raises(InvalidInput, match=r"expected a pass archive with manifest.json"):
         import_archive(ground, tmp_path)
-    with pytest.raises(NotFound, match="pass 5: not found"):
+    with raises(NotFound, match="pass 5: not found"):
         evaluate(ground, 5)

@@ -5,12 +5,11 @@ from types import SimpleNamespace
 from typing import Any, cast
 
 import numpy as np
-import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose, assert_array_equal
 from PIL import Image
-from pytest import approx
+from pytest import approx, mark, raises
 
 from ground_service.errors import InvalidInput
 from ground_service.evaluation import extras
@@ -46,13 +45,13 @@ def two_tones(dark_rows):
     return TerrainMap(image, 0.0, 360.0, -90.0, 90.0)
 
 
-@pytest.mark.parametrize("dark_rows", [20, 90, 160])
+@mark.parametrize("dark_rows", [20, 90, 160])
 def test_the_limit_lies_between_two_tones_however_much_there_is_of_each(dark_rows):
     assert 59 < dark_limit(two_tones(dark_rows)) <= 200
 
 
-@pytest.mark.parametrize(
-    ("latitude_deg", "longitude_deg", "terrain"),
+@mark.parametrize(
+    "latitude_deg, longitude_deg, terrain",
     [
         ([80.0, 80.0, -10.0, math.nan], [10.0, -10.0, 359.9, 5.0], ("mare", "mare", "highland", "")),
         ([90.0, -90.0, 0.0], [0.0, 360.0, 359.999999], ("mare", "highland", "highland")),
@@ -190,11 +189,11 @@ def test_an_albedo_map_is_read_once_by_all_processes_until_its_file_changes(tmp_
 
 def test_a_file_that_is_no_picture_is_reported(tmp_path):
     (tmp_path / "albedo.jpg").write_text("no picture")
-    with pytest.raises(InvalidInput, match="cannot be read"):
+    with raises(InvalidInput, match="cannot be read"):
         surface_map(tmp_path / "albedo.jpg")
 
 
-@pytest.mark.real_data
+@mark.real_data
 def test_a_fifth_of_the_real_moon_is_dark_and_the_sea_of_tranquillity_is(data_path):
     # Maria cover about 17 % of the Moon (Head 1976, Reviews of Geophysics 14, 265); other ground is darker.
     albedo = find_data(data_path).albedo
@@ -282,7 +281,7 @@ def test_what_is_not_known_is_not_guessed():
 def test_no_samples_have_no_sums_and_bounds_are_those_of_printed_tables():
     assert nees(np.zeros((0, 3)), np.zeros((0, 3, 3))).shape == (0,)
     assert nees(np.ones((4, 5, 3)), np.eye(3)).shape == (4, 5)
-    with pytest.raises(ValueError, match=r"expected errors \(..., d\)"):
+    with raises(ValueError, match=r"expected errors \(..., d\)"):
         nees(np.ones(3), np.eye(2))
     # Quantiles of chi-square at 0.025 and 0.975 as tables print them (NIST/SEMATECH e-Handbook, 1.3.6.7.4).
     low, high = bounds([1, 3, 6, 100])
@@ -371,7 +370,7 @@ def test_a_telemetered_attitude_wins_over_the_declared_pointing():
     assert viewing.known(np.array([999, 1_000, 1_001])).tolist() == [False, True, False]
 
 
-@pytest.mark.parametrize("telemetered", [True, False])
+@mark.parametrize("telemetered", [True, False])
 def test_a_snapshot_of_a_tilted_distorted_camera_finds_its_place(telemetered):
     craters = catalogue()
     pairs = Pairs(

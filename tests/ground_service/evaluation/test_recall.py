@@ -4,9 +4,8 @@ from dataclasses import replace
 from operator import attrgetter
 
 import numpy as np
-import pytest
 from numpy.testing import assert_allclose, assert_array_equal
-from pytest import approx
+from pytest import approx, fixture, mark
 
 from ground_service.evaluation.recall import ExpectedCraters, expected_craters, match_detections, score_detections
 from ground_service.telemetry.samples import DetectionSamples
@@ -45,7 +44,7 @@ def detections(u, v, d, classes, usable=True):
     )
 
 
-@pytest.fixture(scope="module")
+@fixture(scope="module")
 def expected():
     return expected_craters(field(), CAMERA, POSITION)
 
@@ -90,8 +89,8 @@ def test_a_perfect_detector_scores_one_and_a_second_detection_of_a_crater_is_a_f
     assert middle.localisation_px == 0.0
 
 
-@pytest.mark.parametrize(
-    ("offset_px", "width", "hit"),
+@mark.parametrize(
+    "offset_px, width, hit",
     [(9.9, 1.0, True), (10.1, 1.0, False), (0.0, 2.1, False), (0.0, 0.45, False), (0.0, 1.9, True)],
 )
 def test_the_limits_of_a_match(expected, offset_px, width, hit):
@@ -107,7 +106,7 @@ def test_small_craters_count_neither_for_nor_against(expected):
     assert (score.micro.expected, score.micro.false_alarms) == (3, 0)
 
 
-@pytest.mark.parametrize(("usable", "complete"), [(False, True), (True, False)])
+@mark.parametrize("usable, complete", [(False, True), (True, False)])
 def test_unfit_images_and_incomplete_regions_are_left_out(usable, complete):
     expected = expected_craters(field(complete), CAMERA, POSITION)
     micro = scored(detections([3.0], [3.0], [30.0], [1], usable), expected).micro

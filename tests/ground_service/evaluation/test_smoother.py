@@ -3,9 +3,8 @@
 from dataclasses import replace
 
 import numpy as np
-import pytest
 from numpy.testing import assert_allclose, assert_array_equal, assert_array_less
-from pytest import approx
+from pytest import approx, mark, raises
 
 from ground_service.errors import EvaluationError
 from ground_service.evaluation.smoother import (
@@ -149,7 +148,7 @@ def test_a_burn_that_nobody_commanded_and_a_clock_that_went_backwards_part_the_o
     assert_array_equal(torn.state[19], session.filtered.state[19])
 
 
-@pytest.mark.parametrize("count", [0, 1])
+@mark.parametrize("count", [0, 1])
 def test_few_states_come_back_as_they_are(count):
     few = Session(7).filtered.select(np.arange(STATES) < count)
     assert_array_equal(smooth(few, QUIET).state, few.state)
@@ -236,8 +235,8 @@ def test_pushed_motion_is_smoothed_as_the_textbook_does_it():
     assert_array_equal(found.utc_ns, filtered.utc_ns)
 
 
-@pytest.mark.parametrize(
-    ("seconds", "pushes", "legs", "kicks"),
+@mark.parametrize(
+    "seconds, pushes, legs, kicks",
     [
         # At the instant of the second state and 20 s after it; two at one instant.
         ([0, 50, 130], [(50, 0.05), (70, 0.05)], [[50.0], [20.0, 60.0]], [[0.05], [0.05, 0.0]]),
@@ -333,5 +332,5 @@ def test_the_shift_of_the_map_is_renewed_over_the_ground():
 
 
 def test_states_in_the_axes_of_the_payload_are_not_smoothed():
-    with pytest.raises(EvaluationError, match="expected states in ICRF, found inertial axes of the payload"):
+    with raises(EvaluationError, match="expected states in ICRF, found inertial axes of the payload"):
         smooth(replace(straight([0.0, 60.0]), frame=ONBOARD), QUIET)

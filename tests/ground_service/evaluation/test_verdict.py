@@ -3,8 +3,7 @@
 from dataclasses import replace
 
 import numpy as np
-import pytest
-from pytest import approx
+from pytest import approx, mark
 
 from ground_service.evaluation.alignment import error_budget, reference_covariance_m2
 from ground_service.evaluation.verdict import (
@@ -79,8 +78,8 @@ CONSISTENT = series(
 )
 
 
-@pytest.mark.parametrize(
-    ("gap_s", "factor", "status", "draws", "bounds", "wrong"),
+@mark.parametrize(
+    "gap_s, factor, status, draws, bounds, wrong",
     [
         (15, 3.1, "met", 1, "0.07 to 3.12", ""),  # one draw: 0.2158 / 3, 9.348 / 3 (tables of chi-square)
         # Ten draws: 16.791 / 30, 46.979 / 30.
@@ -99,8 +98,8 @@ def test_nees_is_judged_by_both_bounds_for_its_independent_draws(gap_s, factor, 
     assert consistency_remarks([judged]) == (cautious if factor < 1.0 else [])
 
 
-@pytest.mark.parametrize(
-    ("key", "limit", "at_limit", "evaluated"),
+@mark.parametrize(
+    "key, limit, at_limit, evaluated",
     [
         ("accuracy.median", "median_error_m", 50.0, {}),
         ("accuracy.p95", "p95_error_m", 90.0, {}),
@@ -152,9 +151,7 @@ def test_the_declared_estimator_is_judged_and_a_pass_for_which_it_is_not_made_na
     assert row("accuracy.median", limits, found(series("paper"))).note == "paper, 10 samples"
 
 
-@pytest.mark.parametrize(
-    ("baseline", "status"), [(51.0, "met"), (50.0, "not met"), (49.0, "not met"), (float("nan"), "unknown")]
-)
+@mark.parametrize("baseline, status", [(51.0, "met"), (50.0, "not met"), (49.0, "not met"), (float("nan"), "unknown")])
 def test_a_baseline_has_to_be_beaten_and_not_only_matched(baseline, status):
     limits = Requirements(estimator="anchored", better_than=("snapshot",))
     evaluated = found(series("anchored"), series("snapshot", "baseline", baseline))
@@ -231,8 +228,8 @@ def table(*statuses):
     return [Requirement(f"k{i}", f"thing {i}", "m", 2.0, 1.0, True, s) for i, s in enumerate(statuses)]
 
 
-@pytest.mark.parametrize(
-    ("statuses", "level", "sentence"),
+@mark.parametrize(
+    "statuses, level, sentence",
     [
         (["met", "met", "not judged"], "met", "2 of 2 requirements met."),
         (
@@ -363,7 +360,7 @@ def test_values_that_are_not_finite_are_unknown_and_the_first_sample_is_no_reset
         assert row("resets", EVERY_LIMIT, started).value == resets
 
 
-@pytest.mark.parametrize("limit", [float("nan"), float("inf")])
+@mark.parametrize("limit", [float("nan"), float("inf")])
 def test_a_limit_that_is_no_number_judges_nothing_as_met(limit):
     one = row("accuracy.median", replace(EVERY_LIMIT, median_error_m=limit), found())
     assert (one.limit, one.status) == (None, "unknown")

@@ -5,8 +5,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import pytest
 from PIL import Image
+from pytest import MonkeyPatch, fixture
 
 from ground_service.ground import open_ground
 from ground_service.missions import frames as declared
@@ -46,7 +46,7 @@ class RichPass:
     craters: list[list[int]]
 
 
-@pytest.fixture(scope="session")
+@fixture(scope="session")
 def rich_pass(make_pass):
     made = make_pass(frames=FRAMES, filter_nis=2.0)
     folder = made.folder
@@ -105,14 +105,11 @@ def _detections(packets, tick):
     return np.column_stack([table.items["u_px"][mine], table.items["v_px"][mine]]).astype(float)
 
 
-@pytest.fixture(scope="module")
+@fixture(scope="module")
 def rich_ground(rich_pass, tmp_path_factory):
     """A service with the pass as pass 1, and with the orientation of the payload; not to be altered."""
     data = DataFolder(orientation_bpc=Path("turned.bpc"))
-    with (
-        pytest.MonkeyPatch.context() as patch,
-        open_ground(tmp_path_factory.mktemp("exports") / "home", data) as ground,
-    ):
+    with MonkeyPatch.context() as patch, open_ground(tmp_path_factory.mktemp("exports") / "home", data) as ground:
         patch.setattr(declared, "_kernel", lambda data: TurnedOrientation())
         assert import_archive(ground, rich_pass.folder) == 1
         yield ground

@@ -12,12 +12,11 @@ from collections import Counter
 from pathlib import Path
 
 import numpy as np
-import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose, assert_array_equal
 from PIL import Image
-from pytest import approx, raises
+from pytest import approx, fixture, mark, raises
 
 from ground_service.access.service import add_user
 from ground_service.app import create_app
@@ -63,7 +62,7 @@ spiceypy = Lazy("spiceypy")
 CRAFT = spacecraft_id(SPACECRAFT)
 
 
-@pytest.fixture
+@fixture
 def export(rich_ground):
     def run(kind, states="reference"):
         request = ExportRequest.model_validate({"pass_id": 1, "format": kind, "states": states})
@@ -107,7 +106,7 @@ def rows_of(files, name):
     return list(csv.DictReader(io.StringIO(files[f"{name}.csv"].decode())))
 
 
-@pytest.mark.filterwarnings("ignore:ERFA function")
+@mark.filterwarnings("ignore:ERFA function")
 def test_states_of_the_payload_have_the_errors_of_the_report_in_each_format(export, rich_pass, tmp_path):
     """The inertial axes of the payload are turned by 300 m against ICRF; read by oem, SPICE, json and csv."""
     utc_ns, found = rich_pass.utc_ns, {}
@@ -388,8 +387,8 @@ def test_every_format_is_listed_and_gives_the_same_octets_twice(export):
         assert export(name) == export(name), name
 
 
-@pytest.mark.parametrize(
-    ("kind", "states", "expected"),
+@mark.parametrize(
+    "kind, states, expected",
     [
         ("oem", "paper", "reference or anchored .downlinked with velocities."),
         ("oem", "truth", "reference or paper or spherical or anchored"),
@@ -418,7 +417,7 @@ def test_a_pass_without_content_of_a_format_is_one_line(rich_ground):
         export_pass(rich_ground, ExportRequest(pass_id=999, format="images"))
 
 
-@pytest.mark.parametrize("kind", [name for name, one in FORMATS.items() if one.library])
+@mark.parametrize("kind", [name for name, one in FORMATS.items() if one.library])
 def test_a_missing_library_is_one_line_with_its_extra(export, monkeypatch, kind):
     usual, chosen = importlib.util.find_spec, FORMATS[kind]
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None if name == chosen.library else usual(name))
@@ -428,7 +427,7 @@ def test_a_missing_library_is_one_line_with_its_extra(export, monkeypatch, kind)
     assert not next(one for one in list_formats() if one.name == kind).available
 
 
-@pytest.fixture
+@fixture
 def linna(rich_ground, tmp_path, capsys):
     """Run an export to a place below `tmp_path`; return its status and what it prints."""
 
@@ -451,8 +450,8 @@ def test_the_command_writes_one_file_or_several_into_a_folder_or_a_zip(linna, tm
         assert sorted(archive.namelist()) == sorted(Path(file).name for file in json.loads(text)["files"])
 
 
-@pytest.mark.parametrize(
-    ("arguments", "place", "message"),
+@mark.parametrize(
+    "arguments, place, message",
     [
         ("1 --format aem", "folder", "--out: expected a file for aem, found a folder"),
         ("1 --format csv", "file", "--out: expected a folder for csv, found a file"),
@@ -531,7 +530,7 @@ def test_cut_rings_keep_the_area_and_turn_counterclockwise(east, north, size, po
         assert_array_equal(part[0], part[-1])
 
 
-@pytest.mark.parametrize("pole", [90.0, -90.0])
+@mark.parametrize("pole", [90.0, -90.0])
 def test_a_ring_around_a_pole_is_closed_over_it(pole):
     east = np.arange(-170.0, 180.0, 20.0)
     parts = cut_ring(np.column_stack([east, np.full(len(east), np.sign(pole) * 85.0)]))

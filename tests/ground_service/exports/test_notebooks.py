@@ -9,8 +9,8 @@ import time
 from pathlib import Path
 
 import numpy as np
-import pytest
 import uvicorn
+from pytest import approx, fixture, mark, raises
 
 import docs_site
 import linna
@@ -33,17 +33,17 @@ def check(archive):
     residuals = one.residuals
     spherical = residuals[residuals["solution"] == "spherical"]
     assert len(spherical) == FRAMES
-    assert spherical["error_3d_m"].median() == pytest.approx(np.linalg.norm(SPHERICAL_ERROR_RTN_M), abs=1.0)
+    assert spherical["error_3d_m"].median() == approx(np.linalg.norm(SPHERICAL_ERROR_RTN_M), abs=1.0)
     assert residuals.attrs["units"]["error_3d_m"] == "m"
     assert str(one.states["utc"].dtype) == "datetime64[ns, UTC]"
     assert one.states["utc"].iloc[0].isoformat() == "2029-08-07T06:00:00+00:00"
     assert sorted(one.images) == [0, 4, 8]
     assert one.images[4][0, 0] == 40
     summary = archive.summary()
-    assert summary.loc[one.id, "spherical median_3d_m"] == pytest.approx(spherical["error_3d_m"].median(), rel=1e-3)
+    assert summary.loc[one.id, "spherical median_3d_m"] == approx(spherical["error_3d_m"].median(), rel=1e-3)
 
 
-@pytest.mark.filterwarnings("ignore:ERFA function")  # leap seconds of 2029 are not announced
+@mark.filterwarnings("ignore:ERFA function")  # leap seconds of 2029 are not announced
 def test_the_examples_of_other_tools_run_where_the_tool_is_installed(rich_ground, tmp_path, monkeypatch, capsys):
     monkeypatch.setenv("LINNA_HOME", str(rich_ground.home))
     monkeypatch.chdir(tmp_path)
@@ -70,7 +70,7 @@ def test_an_archive_is_opened_as_folder_and_as_zip(rich_pass):
         named.unlink()
 
 
-@pytest.fixture
+@fixture
 def server(rich_ground):
     """Address of a server on the home folder, and a token."""
     port = free_port()
@@ -102,15 +102,15 @@ def test_a_home_folder_is_opened_and_its_tables_have_the_types_of_their_columns(
         assert one.states.loc[one.states["estimator"] == "paper", "sigma_r_m"].isna().all()
         tree = one.dataset()
         np.testing.assert_array_equal(tree["detections"]["u_px"].values, detections["u_px"].to_numpy())
-        with pytest.raises(UsageError, match=r"table: expected states, residuals.*, found 'statse'"):
+        with raises(UsageError, match=r"table: expected states, residuals.*, found 'statse'"):
             one.table("statse")
 
 
-@pytest.mark.parametrize("name", ["missing", "empty"])
+@mark.parametrize("name", ["missing", "empty"])
 def test_a_source_of_no_kind_is_one_line(tmp_path, name):
     (tmp_path / "empty").mkdir()
     found = "another folder" if name == "empty" else "none"
-    with pytest.raises(UsageError, match=rf"{name}: expected a home folder with linna.db, .*, found {found}"):
+    with raises(UsageError, match=rf"{name}: expected a home folder with linna.db, .*, found {found}"):
         linna.open(tmp_path / name)
     assert list((tmp_path / "empty").iterdir()) == []
 
@@ -125,11 +125,11 @@ def test_without_pandas_one_line_names_the_extra(rich_ground, monkeypatch):
 
     with linna.open(rich_ground.home) as archive:
         monkeypatch.setattr(builtins, "__import__", without)
-        with pytest.raises(MissingLibrary, match=r"pandas, found none; install linna\[notebook\]"):
+        with raises(MissingLibrary, match=r"pandas, found none; install linna\[notebook\]"):
             _ = archive.passes[0].states
 
 
-@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
+@mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
 def test_a_notebook_is_stored_without_outputs_and_small(path):
     assert [one.stem for one in NOTEBOOKS] == ["campaign", "detector", "pass"]
     assert path.stat().st_size < 20_000
@@ -137,8 +137,8 @@ def test_a_notebook_is_stored_without_outputs_and_small(path):
         assert cell.get("outputs", []) == [] and cell.get("execution_count") is None
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
+@mark.slow
+@mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
 def test_a_notebook_runs(path, rich_ground, monkeypatch):
     import nbformat  # two seconds, which the other tests need not spend
     from nbclient import NotebookClient

@@ -2,7 +2,7 @@
 
 import json
 
-import pytest
+from pytest import fixture, mark, param
 
 from ground_service.app import create_app
 from ground_service.contacts.commanding.service import enter_command
@@ -47,7 +47,7 @@ OCTETS = (
 )  # fmt: skip
 
 
-@pytest.fixture(scope="module")
+@fixture(scope="module")
 def client(synthetic_pass, tmp_path_factory):
     """A service with one of everything; errors are answered, not raised, as they are in operation."""
     settings = Settings(home=tmp_path_factory.mktemp("nasty"), upload_limit_mib=1)
@@ -71,7 +71,7 @@ def checked(client, method, path, operation, **request):
         assert answer.json()["status"] == answer.status_code
 
 
-@pytest.mark.parametrize("every", [20, pytest.param(1, marks=pytest.mark.campaign)])
+@mark.parametrize("every", [20, param(1, marks=mark.campaign)])
 def test_no_request_makes_the_server_fail(client, every):
     """Each parameter and body is asked with one of `every` values, the next one with other values."""
     document = client.get("/api/v1/openapi.json").json()

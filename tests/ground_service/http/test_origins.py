@@ -3,7 +3,7 @@
 import json
 import logging
 
-import pytest
+from pytest import fixture, mark, raises
 from starlette.websockets import WebSocketDisconnect
 
 from ground_service.access.service import add_user
@@ -19,7 +19,7 @@ OWN = {"Origin": BASE}
 PING = {"name": "test_connection", "arguments": {}, "spacecraft_id": 76}
 
 
-@pytest.fixture(scope="module")
+@fixture(scope="module")
 def client(tmp_path_factory):
     """A service without users, as on a laptop."""
     settings = Settings(home=tmp_path_factory.mktemp("origins"), allowed_hosts=("ground.example",))
@@ -33,7 +33,7 @@ def refused(answer, status):
     return bool(answer.json()["status"] == status)
 
 
-@pytest.mark.parametrize(
+@mark.parametrize(
     "host",
     ["attacker.example", "attacker.example:8042", "127.0.0.1.attacker.example", "localhost.attacker.example",
      "192.0.2.7:8042", "user@127.0.0.1", "[::2]:8042", "0.0.0.0:8042"],
@@ -42,13 +42,11 @@ def test_a_name_that_is_not_ours_reads_nothing(client, host):
     for path in (f"{V1}/passes", "/", "/metrics", f"{V1}/openapi.json"):
         answer = client.get(path, headers={"Host": host})
         assert answer.status_code in (400, 421), (path, answer.text)
-    with pytest.raises(WebSocketDisconnect), client.websocket_connect(f"{V1}/live", headers={"Host": host}):
+    with raises(WebSocketDisconnect), client.websocket_connect(f"{V1}/live", headers={"Host": host}):
         pass
 
 
-@pytest.mark.parametrize(
-    "host", ["127.0.0.1", "localhost:8042", "LOCALHOST.", "[::1]:8042", "[0:0::1]", "ground.example:443"]
-)
+@mark.parametrize("host", ["127.0.0.1", "localhost:8042", "LOCALHOST.", "[::1]:8042", "[0:0::1]", "ground.example:443"])
 def test_our_own_names_are_served(client, host):
     assert client.get(f"{V1}/passes", headers={"Host": host}).status_code == 200
 
@@ -74,7 +72,7 @@ BROWSERS = """
 """
 
 
-@pytest.mark.parametrize("browser", [*map(json.loads, BROWSERS.strip().splitlines())], ids=str)
+@mark.parametrize("browser", [*map(json.loads, BROWSERS.strip().splitlines())], ids=str)
 def test_a_page_of_another_origin_changes_nothing(client, browser):
     queued = client.post(f"{V1}/telecommands", json=PING).json()["id"]
     for method, path, body in (
@@ -105,7 +103,7 @@ def test_pages_of_another_site_do_not_watch_or_read_but_may_link(client):
     for path in (f"{V1}/live", f"{V1}/payload"):
         for origin in ("https://attacker.example", "null", "http://127.0.0.1:3000"):
             headers = {"Origin": origin, "Host": "127.0.0.1:8042"}
-            with pytest.raises(WebSocketDisconnect), client.websocket_connect(path, headers=headers):
+            with raises(WebSocketDisconnect), client.websocket_connect(path, headers=headers):
                 pass
     for headers in ({}, OWN):
         with client.websocket_connect(f"{V1}/live", headers={"Host": "127.0.0.1:8042", **headers}):
@@ -115,7 +113,7 @@ def test_pages_of_another_site_do_not_watch_or_read_but_may_link(client):
     assert client.get("/passes", headers={**cross, "Sec-Fetch-Mode": "navigate"}).status_code == 200
 
 
-@pytest.mark.parametrize(
+@mark.parametrize(
     "proxies, client, secure",
     [(("10.0.0.0/24",), "198.51.100.4", True), (("10.0.1.0/24",), "10.0.0.5", False), ((), "10.0.0.5", False)],
 )
@@ -138,7 +136,7 @@ def test_forwarded_headers_count_only_from_a_trusted_proxy(tmp_path, caplog, pro
 
 def test_a_proxy_that_is_no_address_is_refused_at_the_start(monkeypatch):
     monkeypatch.setenv("LINNA_TRUSTED_PROXIES", "10.0.0.1, proxy.example")
-    with pytest.raises(SettingsError, match=r"LINNA_TRUSTED_PROXIES: .*found 'proxy\.example'"):
+    with raises(SettingsError, match=r"LINNA_TRUSTED_PROXIES: .*found 'proxy\.example'"):
         load_settings()
     monkeypatch.setenv("LINNA_TRUSTED_PROXIES", "10.0.0.1, 10.2.0.0/16,")
     monkeypatch.setenv("LINNA_ALLOWED_HOSTS", "ground.example,other.example")

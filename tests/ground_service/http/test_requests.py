@@ -14,9 +14,9 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import get_args
 
-import pytest
 from fastapi.routing import APIRoute
 from pydantic import BaseModel
+from pytest import fixture, mark, raises
 from starlette.requests import ClientDisconnect
 
 from ground_service import logs
@@ -44,7 +44,7 @@ V1 = "/api/v1"
 JSON = {"Content-Type": "application/json"}
 
 
-@pytest.fixture(scope="module")
+@fixture(scope="module")
 def client(tmp_path_factory):
     """An empty service."""
     settings = Settings(home=tmp_path_factory.mktemp("requests"))
@@ -58,7 +58,7 @@ def detail(answer, status):
     return str(answer.json()["detail"])
 
 
-@pytest.mark.parametrize("query", ["kind=%00", "kind=a%0Ab", "kind=%1b[31m", "kind=%7f", "kind=%C2%85", "%00=1"])
+@mark.parametrize("query", ["kind=%00", "kind=a%0Ab", "kind=%1b[31m", "kind=%7f", "kind=%C2%85", "%00=1"])
 def test_control_characters_in_a_query_are_refused(client, query):
     assert detail(client.get(f"{V1}/jobs?{query}"), 422).startswith("query: expected no control characters")
 
@@ -75,7 +75,7 @@ limit=5&__= | found '__'
 """
 
 
-@pytest.mark.parametrize("query, words", cells(UNKNOWN))
+@mark.parametrize("query, words", cells(UNKNOWN))
 def test_an_unknown_query_key_is_refused_with_the_nearest_known(client, query, words):
     assert words in detail(client.get(f"{V1}/jobs?{query}"), 422)
 
@@ -87,7 +87,7 @@ REPEATED = """
 """
 
 
-@pytest.mark.parametrize("path, words", cells(REPEATED))
+@mark.parametrize("path, words", cells(REPEATED))
 def test_a_query_key_with_one_value_is_taken_once(client, path, words):
     assert words in detail(client.get(V1 + path), 422)
 
@@ -97,9 +97,9 @@ def test_a_query_key_with_a_list_of_values_is_taken_several_times(client):
     assert "once" not in detail(answer, 404)
 
 
-@pytest.mark.parametrize("path", ["live?afer=1", "live?after=1&after=2", "payload?after=1"])
+@mark.parametrize("path", ["live?afer=1", "live?after=1&after=2", "payload?after=1"])
 def test_a_websocket_refuses_query_keys_it_does_not_know(client, path):
-    with pytest.raises(WebSocketDenialResponse) as refusal, client.websocket_connect(f"{V1}/{path}"):
+    with raises(WebSocketDenialResponse) as refusal, client.websocket_connect(f"{V1}/{path}"):
         pass
     assert "expected" in detail(refusal.value, 422)
 
@@ -120,7 +120,7 @@ AMBIGUOUS = r"""
 """
 
 
-@pytest.mark.parametrize("body, words", cells(AMBIGUOUS))
+@mark.parametrize("body, words", cells(AMBIGUOUS))
 def test_json_with_no_or_two_meanings_is_refused(client, body, words):
     for path in ("/windows", "/telecommands", "/passes", "/requests"):
         assert words in detail(client.post(f"{V1}{path}", content=body, headers=JSON), 422)
@@ -158,14 +158,14 @@ GET | /uplink | POST
 """
 
 
-@pytest.mark.parametrize("method, path, allowed", cells(METHODS))
+@mark.parametrize("method, path, allowed", cells(METHODS))
 def test_a_method_that_is_not_allowed_is_answered_with_those_that_are(client, method, path, allowed):
     answer = client.request(method, V1 + path)
     assert detail(answer, 405)
     assert answer.headers["Allow"] == allowed
 
 
-@pytest.mark.parametrize(
+@mark.parametrize(
     "error",
     [
         DatabaseUnavailable("postgresql+psycopg://linna:***@db.internal:5432/linna", "server closed"),
@@ -286,7 +286,7 @@ def test_a_log_entry_is_one_json_object_with_what_was_passed():
         logging.config.DictConfigurator(logging_config(style))
 
 
-@pytest.mark.parametrize("style", ["text", "json"])
+@mark.parametrize("style", ["text", "json"])
 def test_what_a_client_sent_makes_neither_a_line_nor_a_terminal_sequence(style):
     """A path is decoded before it is logged: `GET /%0a2026-01-01 INFO forged`."""
     configuration = logging.config.DictConfigurator(logging_config(style))
@@ -314,9 +314,7 @@ def read_only(*_, **__):
     raise OSError(errno.EROFS, os.strerror(errno.EROFS))
 
 
-@pytest.mark.parametrize(
-    "failing, status, words", [(full, 507, "no space left"), (read_only, 503, "cannot be written")]
-)
+@mark.parametrize("failing, status, words", [(full, 507, "no space left"), (read_only, 503, "cannot be written")])
 def test_an_upload_that_cannot_be_kept_is_refused_and_readiness_tells(
     client, synthetic_pass, monkeypatch, failing, status, words
 ):
@@ -355,7 +353,7 @@ def test_an_ingest_that_a_full_disk_stops_is_done_when_there_is_space(client, sy
 
     with monkeypatch.context() as disk:
         disk.setattr(ingest_store, "store_batch", no_space)
-        with pytest.raises(StorageFull):
+        with raises(StorageFull):
             run_job(ground, job)
     stopped = client.get(f"{V1}/jobs/{job}").json()
     assert (stopped["state"], stopped["attempts"]) == ("queued", 0)

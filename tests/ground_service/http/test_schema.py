@@ -3,10 +3,10 @@
 import json
 import os
 
-import pytest
 import schemathesis
 from hypothesis import HealthCheck, Phase, given, settings
 from pydantic import SecretStr
+from pytest import fixture, mark, param
 from schemathesis import GenerationMode
 from schemathesis.checks import not_a_server_error
 from schemathesis.specs.openapi.checks import (
@@ -58,7 +58,7 @@ class Queue:
         pass
 
 
-@pytest.fixture(scope="module", params=["sqlite", pytest.param("postgresql", marks=pytest.mark.campaign)])
+@fixture(scope="module", params=["sqlite", param("postgresql", marks=mark.campaign)])
 def client(request, synthetic_pass, tmp_path_factory):
     deployment = Settings(home=tmp_path_factory.mktemp("fuzz"))
     if request.param == "postgresql":
@@ -71,7 +71,7 @@ def client(request, synthetic_pass, tmp_path_factory):
         yield opened
 
 
-@pytest.mark.parametrize("mode", [GenerationMode.POSITIVE, GenerationMode.NEGATIVE])
+@mark.parametrize("mode", [GenerationMode.POSITIVE, GenerationMode.NEGATIVE])
 def test_every_operation_answers_as_its_schema_says(client, mode):
     document = client.get(f"{V1}/openapi.json").json()
     schema = schemathesis.openapi.from_dict(document)

@@ -13,7 +13,7 @@ from typing import Any, cast
 from unittest.mock import Mock
 
 import numpy as np
-import pytest
+from pytest import approx, fixture, mark, raises
 
 from ground_service.errors import EvaluationError, InvalidInput, NotFound
 from ground_service.http.model import Paging
@@ -72,7 +72,7 @@ def enter(ground, text=DEFINED, document=foreign.BUS):
 RENAMED = foreign.BUS.replace('"VOLTAGE"', '"BATTERY"')
 
 
-@pytest.fixture
+@fixture
 def declared(ground):
     enter(ground)
     return ground
@@ -139,9 +139,9 @@ def test_packets_without_a_checksum_between_others_become_series(either, tmp_pat
     assert found.buckets.mean.tolist() == expected
     voltage = newest["VOLTAGE"]
     assert (voltage.packet, voltage.value, voltage.unit) == ("Housekeeping", expected[-1], "V")
-    assert voltage.time.utc_ns == pytest.approx(START + 299 * NS, abs=15_259)
+    assert voltage.time.utc_ns == approx(START + 299 * NS, abs=15_259)
     assert "temperature_c" in newest
-    assert found.buckets.start_utc_ns.tolist() == pytest.approx([START + k * NS for k in range(300)], abs=15_259)
+    assert found.buckets.start_utc_ns.tolist() == approx([START + k * NS for k in range(300)], abs=15_259)
     assert parameter_series(either, 1, "MODE", 1000).samples == 300  # codes
     listed = pass_parameters(either, 1)
     assert {one.packet: one.packets for one in listed.packets} == {
@@ -161,7 +161,7 @@ def test_a_minimal_description_of_a_definition_decodes_its_packets(ground, tmp_p
     result = take(ground, bus_packets(8))
     assert ground.read(readable_decoding, result.vehicle_id).counts["100"] == {"decoded": 8}
     bare = foreign.document(foreign.integer("u8", 8), {"a": "u8"}, foreign.container("P", ["a"]))
-    with pytest.raises(InvalidInput, match="compares its APID with a number, found none"):
+    with raises(InvalidInput, match="compares its APID with a number, found none"):
         written(tmp_path, bare)
 
 
@@ -180,7 +180,7 @@ def test_a_minimal_description_is_one_that_the_check_accepts(tmp_path):
     )
     found, faults = check_mission_file(saved(tmp_path, written(tmp_path / "a", bus)))
     assert not faults and found is not None and found.packets is not None and found.packets[0].apids == (7,)
-    with pytest.raises(InvalidInput, match=r"XTCE that is supported, found bus\.xml, line 1.*UnitsSet"):
+    with raises(InvalidInput, match=r"XTCE that is supported, found bus\.xml, line 1.*UnitsSet"):
         written(tmp_path / "b", foreign.BUS.replace("UnitSet", "UnitsSet"))
     same = bus.replace('name="CCSDSPacket" abstract="true"', 'name="CCSDSPacket"')
     assert '"apids" = [7]' in written(tmp_path / "c", same)
@@ -199,7 +199,7 @@ UNIX = (
 )
 
 
-@pytest.mark.parametrize("epoch", ["1970-01-01T00:00:00Z", "1980-01-01T00:00:00Z", "2000-01-01T00:00:00Z"])
+@mark.parametrize("epoch", ["1970-01-01T00:00:00Z", "1980-01-01T00:00:00Z", "2000-01-01T00:00:00Z"])
 def test_a_unix_clock_counts_no_leap_seconds(epoch):
     time = PacketTime.model_validate(read_table(f"t = {UNIX.replace('EPOCH', epoch)}", "t", "TOML")["t"])
     count = (START - parse_utc(epoch)) // NS
@@ -208,7 +208,7 @@ def test_a_unix_clock_counts_no_leap_seconds(epoch):
     ticks = decoding.packet_times(packet + bare, whole_packets(np.array([len(packet), len(bare)])), time)
     assert utc_ns_from_ticks(ticks[:1]).tolist() == [START + NS // 2]
     assert ticks[1] == NO_TICKS  # its header says that it has no time
-    with pytest.raises(ValueError, match="an epoch in UTC for a CDS code or a Unix clock"):
+    with raises(ValueError, match="an epoch in UTC for a CDS code or a Unix clock"):
         PacketTime.model_validate({**time.model_dump(), "epoch": "1970-01-01T00:00:00 TAI"})
 
 
@@ -266,14 +266,14 @@ def test_a_series_has_least_greatest_and_mean_value_from_samples_and_from_rollup
     values = np.array([packet["RATE"] for packet in interpreted(housekeeping, tmp_path)])
     assert exact.buckets.low.min() == values.min()
     assert exact.buckets.high.max() == values.max()
-    assert np.average(exact.buckets.mean, weights=exact.buckets.count) == pytest.approx(values.mean())
+    assert np.average(exact.buckets.mean, weights=exact.buckets.count) == approx(values.mean())
     monkeypatch.setattr(series, "FEW_ROWS", 10)
     for coarse in (10**9, 0):  # from roll-ups, from samples
         monkeypatch.setattr(series, "COARSE", coarse)
         rolled = parameter_series(either, pass_id, "RATE", 11).buckets
         assert int(rolled.count.sum()) == 2000
         assert (rolled.low.min(), rolled.high.max()) == (values.min(), values.max())
-        assert np.average(rolled.mean, weights=rolled.count) == pytest.approx(values.mean())
+        assert np.average(rolled.mean, weights=rolled.count) == approx(values.mean())
     assert trend_series(either, 76, "flight", "RATE", 11).samples == 2000
 
 
@@ -285,20 +285,20 @@ def test_a_later_definition_decodes_what_is_stored_and_packets_without_one_are_k
     result = take(either, bus_packets(100))
     assert (result.packets_new, result.unknown, result.octets_skipped) == (125, 125, 0)
     pass_id = define(either)
-    with pytest.raises(NotFound):
+    with raises(NotFound):
         parameter_series(either, pass_id, "VOLTAGE", 100)
     enter(either)
     assert decoding.decode_declared(either, result.vehicle_id) == 125
     assert parameter_series(either, pass_id, "VOLTAGE", 100).samples == 100
     enter(either, document=RENAMED)
-    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+    with monkeypatch.context() as patch, raises(KeyboardInterrupt):
         whole = Mock(side_effect=[decoding._next_block, KeyboardInterrupt])
         patch.setattr(decoding, "_next_block", lambda *given: whole()(*given))
         decoding.decode_declared(either, result.vehicle_id)
     assert parameter_series(either, pass_id, "VOLTAGE", 100).samples == 100  # still as the earlier one decoded it
     assert decoding.decode_declared(either, result.vehicle_id) == 75
     assert parameter_series(either, pass_id, "BATTERY", 100).samples == 100
-    with pytest.raises(NotFound):
+    with raises(NotFound):
         parameter_series(either, pass_id, "VOLTAGE", 100)
     assert decoding.decode_declared(either, result.vehicle_id) == 0
     assert either.read(repository.newest, SAMPLES, Paging())[1] == 125
@@ -333,8 +333,8 @@ def test_the_integrity_check_finds_packets_without_a_checksum_intact(declared):
 SAMPLES = repository.PARAMETER_SAMPLES
 
 
-@pytest.mark.parametrize(
-    ("changes", "reason"),
+@mark.parametrize(
+    "changes, reason",
     [
         ({"values": bytes(8)}, "values of its packet"),
         ({"container": 77}, "raw data do not give"),
@@ -408,7 +408,7 @@ def test_an_archive_is_decoded_with_the_packets_that_it_declares_and_the_live_sp
     assert found.samples == 40 and found.buckets.mean.tolist()[:1] == expected
     assert pass_parameters(either, pass_id).outcomes == {"100": {"decoded": 40}, "101": {"decoded": 10}}
     assert {one.packets for one in pass_parameters(either, pass_id).packets} == {0}  # their times are not in the pass
-    with pytest.raises(EvaluationError, match="expected packets 'Housekeeping', found none"):
+    with raises(EvaluationError, match="expected packets 'Housekeeping', found none"):
         export_packets(either, pass_id, "Housekeeping", "json")
     assert pass_parameters(either, live).packets == ()
     assert either.read(packets_in_force, 76, "flight") is None
@@ -417,7 +417,7 @@ def test_an_archive_is_decoded_with_the_packets_that_it_declares_and_the_live_sp
     take(either, bus)
     assert trend_series(either, 76, "flight", "BATTERY", 1000).samples == 40
     assert trend_series(either, 76, instance, "VOLTAGE", 1000).samples == 40
-    with pytest.raises(NotFound):
+    with raises(NotFound):
         trend_series(either, 76, instance, "BATTERY", 1000)
     assert undecoded_vehicles(either, 76) == []
     checked = verify(either, rebuild=True)
@@ -434,7 +434,7 @@ def test_an_archive_that_was_imported_before_is_decoded_with_its_packets_on_rede
         patched.setattr(missions, "packets_in_force", lambda *_given: None)
         pass_id = import_archive(either, folder)
     instance = get_pass(either, pass_id).instance
-    with pytest.raises(NotFound):
+    with raises(NotFound):
         trend_series(either, 76, instance, "VOLTAGE", 1000)
     assert len(undecoded_vehicles(either, 76)) == 1
     assert decode_all_again(either) >= 25
@@ -464,7 +464,7 @@ def test_pieces_cut_at_any_octet_in_any_order_give_every_packet(declared, tmp_pa
     assert parameter_series(declared, define(declared), "VOLTAGE", 1000).samples == 120
 
 
-@pytest.mark.parametrize("window", [0, 5_000, 1 << 20])
+@mark.parametrize("window", [0, 5_000, 1 << 20])
 def test_packets_that_nothing_declares_are_kept_between_declared_ones(declared, tmp_path, window, monkeypatch):
     """In frames, and as a bare stream in windows and at once."""
     packets = bus_packets(274)
@@ -493,9 +493,9 @@ def test_decoded_packets_of_a_pass_are_exported_with_utc(declared, synthetic_pas
     assert lines[0].startswith("utc,packet,VERSION")
     own = json.loads(export_packets(declared, pass_id, "event_low", "json"))
     assert {one["packet"] for one in own} == {"event_low"}
-    with pytest.raises(NotFound, match="packet"):
+    with raises(NotFound, match="packet"):
         export_packets(declared, pass_id, "nothing", "csv")
-    with pytest.raises(EvaluationError, match="pass 1: expected packets 'store_report', found none"):
+    with raises(EvaluationError, match="pass 1: expected packets 'store_report', found none"):
         export_packets(declared, pass_id, "store_report", "csv")
     assert export_packets(declared, pass_id, "Housekeeping", "parquet")[:4] == b"PAR1"
 
@@ -525,7 +525,7 @@ clock | clok | packets.0.time.clok: expected 'clock', found unknown key 'clok'
 [100, 101] | [160] | APIDs that the packet dictionary does not use, found 160"""
 
 
-@pytest.mark.parametrize("row", FAULTS.splitlines())
+@mark.parametrize("row", FAULTS.splitlines())
 def test_each_fault_of_a_declaration_is_one_line(tmp_path, row):
     old, new, message = row.split(" | ")
     text = DEFINED * (new == "'two'") + DEFINED.replace(old, new)
@@ -541,7 +541,7 @@ def test_each_faulty_document_is_one_line(tmp_path):
     assert [fault.split(": ")[0].split(", ")[-1] for fault in faults] == ["packets.0.xtce", "packets.1.xtce"]
     assert "line 1" in faults[0] and "UnitsSet" in faults[0]
     (tmp_path / "bus.xml").unlink()
-    with pytest.raises(InvalidInput, match=r"packets.0.xtce: expected the file .*bus\.xml"):
+    with raises(InvalidInput, match=r"packets.0.xtce: expected the file .*bus\.xml"):
         check_mission_file(path)
     assert "expected texts of XTCE documents" in str(read_document(path.read_text(), "m.toml")[0])
 

@@ -1,7 +1,7 @@
 """Packets with an implausible on-board time are kept, named, and decide nothing."""
 
 import numpy as np
-import pytest
+from pytest import mark, raises
 
 from ground_service.access.model import AuditFilter
 from ground_service.access.store import list_audit
@@ -63,8 +63,8 @@ def alarms(ground):
     return {one.name: one.count for one in ground.read(list_alarms, asked).items}
 
 
-@pytest.mark.parametrize("ahead", [2 * HOUR, 26 * HOUR, YEARS])
-@pytest.mark.parametrize("source", ["telemetry", "simulated", "time of day"])
+@mark.parametrize("ahead", [2 * HOUR, 26 * HOUR, YEARS])
+@mark.parametrize("source", ["telemetry", "simulated", "time of day"])
 def test_a_report_from_the_future_is_kept_and_decides_nothing(ground, ahead, source):
     clocks = {"telemetry": TelemetryTime(NOW), "simulated": lambda: NOW, "time of day": None}
     set_mission_clock(clocks[source])
@@ -142,7 +142,7 @@ def test_reception_times_decide_for_single_packets_and_not_for_a_station_whose_c
     assert set(implausible_times(ticks[3:], np.array([NO_TICKS]), TICKS, None)) == {0}
 
 
-@pytest.mark.parametrize("first", [TICKS, TICKS + YEARS, 100 << 16])
+@mark.parametrize("first", [TICKS, TICKS + YEARS, 100 << 16])
 def test_the_first_packet_of_an_archive_decides_nothing_until_a_clock_or_a_second_one_supports_it(ground, first):
     set_mission_clock(TelemetryTime(NOW))
     assert receive(ground, report(first, 0, temperature_c=99.0)) == 1
@@ -176,7 +176,7 @@ def test_a_withdrawn_ingest_leaves_no_trace_but_its_record(either):
     receive(either, foreign)
     assert hash_of(either) != before and alarms(either) != alone
     job = withdraw_ingest(either, 2, reason="another flight", actor="ann")
-    with pytest.raises(StateConflict, match="expected state done, found withdrawing"):
+    with raises(StateConflict, match="expected state done, found withdrawing"):
         withdraw_ingest(either, 2, reason="another flight", actor="ann")
     assert run_job(either, job).state == "done"
     assert (hash_of(either), alarms(either)) == (before, alone)
@@ -262,7 +262,7 @@ def test_a_station_that_the_description_does_not_have_is_refused(either, tmp_pat
     add_mission(either, b'name = "m"\n[spacecraft]\nid = 76\n[link.stations.madrid]\n')
     file = tmp_path / "a.packets"
     file.write_bytes(contact())
-    with pytest.raises(Conflict, match=r"expected one of the mission description \(madrid\), found mars"):
+    with raises(Conflict, match=r"expected one of the mission description \(madrid\), found mars"):
         ingest_file(either, file, spacecraft_id=76, station="mars")
 
 
@@ -278,7 +278,7 @@ def test_a_lease_that_ended_in_a_standstill_is_renewed_with_its_state(either):
         assert not links.acquire(connection, "l", 76, "flight", wall_utc_ns=10, **given)
 
 
-@pytest.mark.parametrize("ahead", [26 * HOUR, YEARS, 100 * (1 << 16) - TICKS])
+@mark.parametrize("ahead", [26 * HOUR, YEARS, 100 * (1 << 16) - TICKS])
 def test_a_detection_of_an_image_at_another_time_is_kept_apart(ground, ahead):
     def detections(image_ticks, count):
         values = {"frame_number": count, "image_ticks": image_ticks, "image_quality": 0, "items": []}

@@ -10,7 +10,7 @@ import tracemalloc
 from pathlib import Path
 
 import numpy as np
-import pytest
+from pytest import fixture, mark
 from sqlalchemy import func, select
 
 from benchmarks.campaigns.cuts import KINDS, ORDERS, Piece, archive, case_of, ingest
@@ -30,12 +30,12 @@ from tmtc.link.frames import Clcw, pack_clcw
 SPACECRAFT = 76
 
 
-@pytest.fixture(scope="module")
+@fixture(scope="module")
 def packets(make_pass):
     return list(make_pass(frames=30).packets)
 
 
-@pytest.fixture(scope="module")
+@fixture(scope="module")
 def stream(packets):
     return encode_cadus(packets, spacecraft_id=SPACECRAFT, frame_length=223)
 
@@ -61,7 +61,7 @@ def read(octets, window, spacecraft_id=None):
     return packets, found, len(octets) - found.octets_used + found.octets_unused
 
 
-@pytest.mark.parametrize("window", [1 << 20, 8_000, 997])
+@mark.parametrize("window", [1 << 20, 8_000, 997])
 def test_every_packet_comes_through_whatever_the_windows(packets, stream, window):
     found, accounting, skipped = read(stream, window)
     assert set(found) == set(packets)
@@ -70,7 +70,7 @@ def test_every_packet_comes_through_whatever_the_windows(packets, stream, window
     assert accounting.octets_used == len(stream)
 
 
-@pytest.mark.parametrize("window", [1 << 20, 60_000])
+@mark.parametrize("window", [1 << 20, 60_000])
 def test_damage_is_accounted_for_alike_in_windows_and_at_once(stream, window):
     stream = bytearray(stream)
     rng = np.random.default_rng(5)
@@ -120,7 +120,7 @@ def test_memory_does_not_grow_with_the_stream(stream):
     assert max(peaks[4:]) - peaks[3] < len(stream)
 
 
-@pytest.mark.parametrize("window", [1 << 20, 60_000])
+@mark.parametrize("window", [1 << 20, 60_000])
 def test_the_uplink_is_seen_alike_in_windows_and_at_once(packets, window):
     encoder = DownlinkEncoder(SPACECRAFT, LinkSettings(frame_length=223))
     clcws = [pack_clcw(Clcw(0, k // 9, lockout=40 < k < 60, farm_b_counter=k % 4)) for k in range(len(packets))]
@@ -145,13 +145,13 @@ FEW = 2 * len(KINDS)
 """Cases of a run in one process; the campaign has 500."""
 
 
-@pytest.fixture(scope="module")
+@fixture(scope="module")
 def one_process(tmp_path_factory):
     with archive(tmp_path_factory.mktemp("pieces") / "home") as found:
         yield found
 
 
-@pytest.fixture(scope="module")
+@fixture(scope="module")
 def several_processes(tmp_path_factory, new_postgres_database):
     with archive(tmp_path_factory.mktemp("pieces") / "home", new_postgres_database(), 3) as found:
         yield found
@@ -169,12 +169,12 @@ def test_each_kind_meets_each_order_and_each_piece_is_of_its_recording():
             assert all(octets)
 
 
-@pytest.mark.parametrize("number", [k * len(ORDERS) + k for k in range(FEW)])
+@mark.parametrize("number", [k * len(ORDERS) + k for k in range(FEW)])
 def test_any_split_order_and_repetition_gives_the_same_archive(one_process, number):
     assert one_process.difference(case_of(number)) == ""
 
 
-@pytest.mark.parametrize("number", [200 + k * (len(ORDERS) + 1) for k in range(len(KINDS))])
+@mark.parametrize("number", [200 + k * (len(ORDERS) + 1) for k in range(len(KINDS))])
 def test_any_number_of_processes_gives_the_same_archive(several_processes, number):
     assert several_processes.difference(case_of(number)) == ""
 
@@ -191,7 +191,7 @@ CASES = """\
 384 records: headers cut from their frames"""
 
 
-@pytest.mark.parametrize("case", CASES.splitlines())
+@mark.parametrize("case", CASES.splitlines())
 def test_what_a_piece_did_not_show_is_read_with_a_later_one(one_process, case):
     number, kind = case.partition(":")[0].split()
     assert one_process.difference(case_of(int(number), (kind,) * 13)) == ""
@@ -246,12 +246,12 @@ def rows_of(ground, version):
         }
 
 
-@pytest.fixture(scope="module")
+@fixture(scope="module")
 def downlink(make_pass):
     return Path(make_pass(frames=30, seed=4).folder) / "downlink.cadu"
 
 
-@pytest.mark.campaign
+@mark.campaign
 def test_an_ingest_killed_at_any_moment_loses_and_doubles_nothing(downlink, tmp_path):
     """The stream is stored in about ten transactions; the process is killed outright at random moments among them."""
     with open_ground(tmp_path / "whole") as ground:

@@ -7,7 +7,7 @@ from dataclasses import replace
 from unittest.mock import Mock
 
 import numpy as np
-import pytest
+from pytest import fixture, mark, raises
 from sqlalchemy import event, func, select, text
 
 from ground_service.app import create_app
@@ -46,23 +46,23 @@ def rows(ground, table):
         return int(connection.execute(select(func.count()).select_from(table)).scalar_one())
 
 
-@pytest.fixture(scope="module")
+@fixture(scope="module")
 def packets(make_pass):
     return list(make_pass(frames=6).packets)
 
 
-@pytest.fixture(scope="module")
+@fixture(scope="module")
 def stream(packets):
     return encode_cadus(packets, spacecraft_id=SPACECRAFT)
 
 
-@pytest.fixture(scope="module")
+@fixture(scope="module")
 def frames(packets):
     stream = encode_cadus(packets, spacecraft_id=SPACECRAFT, frame_length=223)
     return [stream[at : at + 259] for at in range(0, len(stream), 259)]
 
 
-@pytest.fixture(scope="module")
+@fixture(scope="module")
 def expected(packets, tmp_path_factory):
     with open_ground(tmp_path_factory.mktemp("whole") / "home") as ground:
         ingest(ground, b"".join(packets))
@@ -111,18 +111,16 @@ def stored(ground):
         return set(connection.execute(select(repository.PACKETS.c.octets)).scalars())
 
 
-@pytest.mark.parametrize("octets", [1_000, 70_000])
+@mark.parametrize("octets", [1_000, 70_000])
 def test_noise_is_refused_in_one_line_and_remembered(ground, octets):
-    with pytest.raises(
-        InvalidInput, match=rf"noise\.bin: expected a stream of CADUs or of space packets, found {octets}"
-    ):
+    with raises(InvalidInput, match=rf"noise\.bin: expected a stream of CADUs or of space packets, found {octets}"):
         ingest(ground, np.random.default_rng(3).bytes(octets), "noise.bin")
     record = ground.read(repository.newest, repository.INGESTS, Paging())[0][0]
     assert record["state"] == "failed" and "noise.bin" in record["error"]
 
 
 def test_a_missing_file_is_refused(ground, tmp_path):
-    with pytest.raises(InvalidInput, match="expected a downlink file, found nothing there"):
+    with raises(InvalidInput, match="expected a downlink file, found nothing there"):
         ingest_file(ground, tmp_path / "no.bin", spacecraft_id=SPACECRAFT)
 
 
@@ -148,7 +146,7 @@ def test_octets_that_wait_are_counted_and_are_no_error(ground, packets, stream, 
 def test_an_incomplete_frame_at_either_end_of_a_whole_recording_is_counted(ground, stream):
     result = ingest(ground, stream[300 : 4 * 1279 + 100])
     assert (result.frames, result.octets_pending) == (3, 979 + 100)
-    with pytest.raises(InvalidInput, match=r"600 octets with no frame or packet of .*--recording NAME FILE"):
+    with raises(InvalidInput, match=r"600 octets with no frame or packet of .*--recording NAME FILE"):
         ingest(ground, stream[300:900])
 
 
@@ -221,7 +219,7 @@ class PowerFailure(Exception):
     """The process ends here."""
 
 
-@pytest.mark.parametrize("shuffled", [False, True])
+@mark.parametrize("shuffled", [False, True])
 def test_an_ingest_that_ends_after_any_commit_is_made_up_for_by_the_next(packets, stream, expected, tmp_path, shuffled):
     """A CADU of three pieces, with packets that reach into its neighbours; the piece that completes it is cut off."""
     pieces = [(0, stream[:1700]), (1700, stream[1700:2300]), (2300, stream[2300:])]
@@ -266,7 +264,7 @@ def fill_with_the_old(home, made):
         define_pass_of(ground, made)
 
 
-@pytest.fixture
+@fixture
 def old(tmp_path, synthetic_pass):
     fill_with_the_old(tmp_path / "home", synthetic_pass)
     with open_ground(tmp_path / "home") as ground:
@@ -313,7 +311,7 @@ def test_what_comes_in_meanwhile_and_a_kill_in_the_middle_change_nothing(
     more = make_pass(frames=3, seed=5).folder / "downlink.cadu"
     blocks = Mock(side_effect=[parameters._block, parameters._block, KeyboardInterrupt, *[parameters._block] * 99])
     monkeypatch.setattr(parameters, "_block", lambda *given: blocks()(*given))
-    with pytest.raises(KeyboardInterrupt):
+    with raises(KeyboardInterrupt):
         ingest_file(old, more)
     assert looked_at(old)[0] >= 1  # still as the old dictionary decoded it
     ingest_file(old, more)
@@ -344,7 +342,7 @@ PIECE = (
 )
 
 
-@pytest.fixture
+@fixture
 def begun(synthetic_pass):
     """Octets of a packet in the first frame of the downlink and behind it."""
     at = 0
@@ -355,7 +353,7 @@ def begun(synthetic_pass):
     raise AssertionError
 
 
-@pytest.fixture
+@fixture
 def upgraded(begun, tmp_path, caplog):
     """An archive in which the beginning of a packet waits, and two pieces of 600 octets, one without a position."""
     home = tmp_path / "home"

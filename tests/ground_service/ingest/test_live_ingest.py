@@ -5,7 +5,7 @@ import struct
 from itertools import pairwise
 
 import numpy as np
-import pytest
+from pytest import fixture, mark, raises
 from sqlalchemy import event
 
 from ground_service.errors import InvalidInput, StorageFull
@@ -33,14 +33,14 @@ from tmtc.packets.space_packets import CRC_LENGTH
 from tmtc.packets.stream import cut_packets
 
 
-@pytest.fixture
+@fixture
 def expected(synthetic_pass, tmp_path):
     with open_ground(tmp_path / "whole") as ground:
         ingest_file(ground, synthetic_pass.folder / "downlink.cadu")
         return hash_of(ground)
 
 
-@pytest.fixture
+@fixture
 def stream(synthetic_pass):
     return bytes((synthetic_pass.folder / "downlink.cadu").read_bytes())
 
@@ -69,7 +69,7 @@ def test_segments_cut_at_any_octet_are_pieces_of_one_recording(ground, stream, e
     assert list((ground.home / "spool").iterdir()) == []
 
 
-@pytest.mark.parametrize("drained", [False, True])
+@mark.parametrize("drained", [False, True])
 def test_the_recording_of_a_run_that_crashed_goes_on(ground, stream, expected, drained):
     """Also if all its segments are ingested."""
     crashed = spool_of(ground, [])
@@ -107,7 +107,7 @@ def test_a_segment_stays_in_the_spool_while_the_store_is_full(stream, tmp_path):
 
     spool = Spool(tmp_path, full, lambda *_: None)
     spool.open()
-    with pytest.raises(StorageFull):
+    with raises(StorageFull):
         take(spool, stream)
     assert b"".join(path.read_bytes() for path in tmp_path.glob("*.segment")) == stream
 
@@ -141,7 +141,7 @@ def test_files_that_appear_are_ingested_once_when_they_are_whole(tmp_path):
     os.utime(folder / "a.cadu", (1020.0, 1020.0))
     assert watched().look(1030.0) == 1
     assert [one["file"] for one in seen] == ["a.cadu", "b.cadu", "a.cadu"]
-    with pytest.raises(InvalidInput, match="expected a folder to watch"):
+    with raises(InvalidInput, match="expected a folder to watch"):
         WatchedFolder(tmp_path / "no", tmp_path / "l", lambda _: {}, lambda *_: None).look(0.0)
 
 
@@ -161,7 +161,7 @@ def batch_of(packets, received):
     return batch_of_cut(octets, cut_packets(octets), DICTIONARY, 76, received)
 
 
-@pytest.mark.parametrize("window_octets", [1 << 20, 3_000])
+@mark.parametrize("window_octets", [1 << 20, 3_000])
 def test_a_packet_has_the_reception_time_of_the_frame_in_which_it_begins(window_octets):
     ticks = int(ticks_from_utc_ns(START))
     packets = [report(ticks + k, k) for k in range(400)]
@@ -228,7 +228,7 @@ STATEMENTS = 10
 """Statements of one piece besides the three bulk inserts (packets, samples, roll-ups)."""
 
 
-@pytest.fixture(scope="module")
+@fixture(scope="module")
 def pieces(make_pass):
     """The first one shows the link; the others hold one packet each, in complete frames."""
     packets = list(make_pass(frames=6).packets)

@@ -4,7 +4,7 @@ import itertools
 import struct
 
 import numpy as np
-import pytest
+from pytest import approx, mark, param, raises
 from sqlalchemy import select
 
 from benchmarks.downlink import (
@@ -119,7 +119,7 @@ def test_stated_settings_are_used_as_they_are_and_impossible_ones_are_refused(gr
     assert f"0 of {wrong.frames} frames are valid with the stated link settings" in wrong.remark
     assert ingest(ground, octets, link=right).packets == len(telemetry(30))
     for text in ("frame_length=many", "colour=red", "coding=turbo", "frame_length=3"):
-        with pytest.raises(InvalidInput, match="link"):
+        with raises(InvalidInput, match="link"):
             ingest(ground, octets, link=text)
 
 
@@ -176,7 +176,7 @@ def test_the_bit_error_rate_is_estimated_from_the_corrected_bits(ground):
     quality = ingest(ground, with_bit_errors(cadus(SHORT), 2e-3, 3)).reception
     assert quality.codewords_lost == 0
     # of 4e6 bits 8,200 are wrong: one standard deviation is 1.1 %
-    assert quality.bit_error_rate == pytest.approx(2e-3, rel=0.05)
+    assert quality.bit_error_rate == approx(2e-3, rel=0.05)
     assert quality.symbols_corrected > 7_000
 
 
@@ -191,7 +191,7 @@ def test_lost_bits_and_inverted_frames_are_lock_losses(ground):
 
 def test_packets_without_error_control_are_read_if_the_mission_says_so(ground):
     capture = without_error_control()
-    with pytest.raises(InvalidInput):
+    with raises(InvalidInput):
         ingest(ground, capture.files[0], spacecraft_id=SPACECRAFT)
     add_mission(ground, FOREIGN)
     result = ingest(ground, capture.files[0], spacecraft_id=SPACECRAFT)
@@ -202,7 +202,7 @@ def test_packets_without_error_control_are_read_if_the_mission_says_so(ground):
 def test_packets_behind_octets_of_a_recorder_are_read_if_the_mission_says_so(ground):
     packets = without_error_control().packets[SPACECRAFT]
     octets = b"".join(bytes(3) + packet for packet in sorted(packets))
-    with pytest.raises(InvalidInput, match=r"`linna link check FILE` shows"):
+    with raises(InvalidInput, match=r"`linna link check FILE` shows"):
         ingest(ground, octets, spacecraft_id=SPACECRAFT)
     add_mission(ground, FOREIGN + b"[link.stations.recorder]\npacket_prefix_octets = 3\n")
     result = ingest(ground, octets, spacecraft_id=SPACECRAFT, station="recorder")
@@ -210,7 +210,7 @@ def test_packets_behind_octets_of_a_recorder_are_read_if_the_mission_says_so(gro
     assert stored(ground) == packets
 
 
-@pytest.mark.parametrize("seed", [0, *(pytest.param(k, marks=pytest.mark.campaign) for k in (1, 2, 3))])
+@mark.parametrize("seed", [0, *(param(k, marks=mark.campaign) for k in (1, 2, 3))])
 def test_receptions_of_two_stations_are_merged_in_any_order_and_split(ground, seed):
     rng = np.random.default_rng(seed)
     stream = two_receivers(one_file=False)

@@ -1,9 +1,9 @@
 """Counts of packets: wraps, gaps, restarts, late and stray packets; decoded columns as the store takes them."""
 
 import numpy as np
-import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from pytest import mark
 
 from ground_service.ingest.service import ingest_file
 from ground_service.ingest.store import recordings_of_vehicle
@@ -70,7 +70,7 @@ def test_a_restart_begins_a_new_run_and_one_count_used_twice_is_a_conflict():
     assert counted(np.r_[ticks, ticks[4] + 1], np.r_[counts, counts[4]]) == (0, 0, 1)
 
 
-@pytest.mark.parametrize("years", [-29, 40])
+@mark.parametrize("years", [-29, 40])
 def test_a_packet_from_another_age_does_not_disturb_the_rest(years):
     ticks, counts = stream(1000, first=5000)
     ticks = ticks + 29 * 31_557_600 * SECOND
@@ -91,7 +91,7 @@ def test_few_packets_have_no_rate_and_a_silence_hides_no_wraps():
     assert (gap.before_ticks, gap.after_ticks) == (int(ticks[-1]), int(later[0]))
 
 
-@pytest.mark.parametrize(("silence_s", "restarts", "lost"), [(600, 1, 0), (1000, 0, 8383)])
+@mark.parametrize("silence_s, restarts, lost", [(600, 1, 0), (1000, 0, 8383)])
 def test_wraps_are_looked_for_where_half_of_one_could_have_been_made(silence_s, restarts, lost):
     """At ten packets a second 600 s hold 6000 of them and 1000 s hold 10,000; half a wrap is 8192.
 

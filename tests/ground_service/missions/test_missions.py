@@ -4,7 +4,7 @@ import json
 import logging
 from concurrent.futures import ThreadPoolExecutor
 
-import pytest
+from pytest import mark, raises
 
 from ground_service.access.service import Caller
 from ground_service.contacts.commanding.service import enter_command, release_command
@@ -62,10 +62,10 @@ fov_deg = | expected TOML
 """
 
 
-@pytest.mark.parametrize("line, message", cells(FAULTS))
+@mark.parametrize("line, message", cells(FAULTS))
 def test_a_fault_is_named_with_its_place_what_was_expected_and_what_was_found(line, message):
     text = f'name = "test"\n[camera]\n{line}\n'
-    with pytest.raises(InvalidInput) as caught:
+    with raises(InvalidInput) as caught:
         parse_mission(text, "m.toml")
     place = "m.toml" if message == "expected TOML" else f"m.toml, camera.{line.split()[0]}"
     assert str(caught.value).startswith(f"{place}: {message}")
@@ -105,7 +105,7 @@ photographs | None | 5
 """
 
 
-@pytest.mark.parametrize("world, share, level", cells(LEVELS))
+@mark.parametrize("world, share, level", cells(LEVELS))
 def test_the_evidence_level_follows_from_the_world_that_was_flown(world, share, level):
     values = {"world": world, "unseen_share": share if share == "None" else float(share)}
     assert str(Evidence(**{name: value for name, value in values.items() if value != "None"}).level) == level
@@ -130,10 +130,10 @@ def test_entering_the_same_content_again_gives_the_same_revision(ground):
     assert ground.read(find_revision, first.revision[:8]) == first
 
 
-@pytest.mark.parametrize("name", ["", "xyz", "0000000", "00000000", "%" * 8, "a" * 65])
+@mark.parametrize("name", ["", "xyz", "0000000", "00000000", "%" * 8, "a" * 65])
 def test_a_revision_that_is_not_entered_is_not_found(ground, name):
     add_mission(ground, TEXT.encode())
-    with pytest.raises(NotFound):
+    with raises(NotFound):
         ground.read(find_revision, name)
 
 
@@ -200,7 +200,7 @@ def test_a_description_that_came_with_an_archive_is_in_force_once_a_person_enter
 
 def test_a_description_of_another_spacecraft_is_refused_and_nothing_is_stored(ground, make_pass):
     folder = make_pass(frames=2, seed=32, mission=TEXT.replace("id = 76", "id = 5")).folder
-    with pytest.raises(InvalidInput, match=r"mission\.toml, spacecraft\.id: expected 76 .*, found 5"):
+    with raises(InvalidInput, match=r"mission\.toml, spacecraft\.id: expected 76 .*, found 5"):
         import_archive(ground, folder)
     assert ground.read(list_missions, Paging()).items == []
 
@@ -214,7 +214,7 @@ DECLARED = """
 """
 
 
-@pytest.mark.parametrize("manifest, expected", cells(DECLARED))
+@mark.parametrize("manifest, expected", cells(DECLARED))
 def test_the_orientation_of_an_old_archive_is_read_where_it_was_declared(manifest, expected):
     assert str(mission_of_manifest(json.loads(manifest)).frames.orientation) == expected
 
@@ -278,16 +278,16 @@ OPERATOR = Caller("ann", "operator")
 
 
 def test_only_an_administrator_changes_which_telecommands_need_a_second_person(ground):
-    with pytest.raises(Forbidden, match="expected an administrator"):
+    with raises(Forbidden, match="expected an administrator"):
         add_mission(ground, approval_text(RELAXED), actor="ann", caller=OPERATOR)
     add_mission(ground, approval_text(RAISED), actor="root")
-    with pytest.raises(Forbidden):
+    with raises(Forbidden):
         add_mission(ground, TEXT.encode(), actor="ann", caller=OPERATOR)
     changed = approval_text(RAISED).replace(b"fov_deg = 120", b"fov_deg = 119")
     assert add_mission(ground, changed, actor="ann", caller=OPERATOR).entered_by == "ann"
 
 
-@pytest.mark.parametrize(
+@mark.parametrize(
     "line, message",
     [
         ('one_person_for = ["replay_stor"]', "expected 'replay_store', found 'replay_stor'"),
@@ -302,7 +302,7 @@ def test_a_rule_about_a_telecommand_that_does_not_exist_or_twice_is_refused(line
 def test_windows_approved_automatically_with_critical_telecommands_are_refused(ground, tmp_path):
     extra = '\n[approval]\nwindows = "automatic"\n[uploads]\ntables = ["orientation"]\n'
     found = "a second person needed for perform_function/set_mode, uplink_first, uplink_middle, uplink_last"
-    with pytest.raises(InvalidInput, match=found):
+    with raises(InvalidInput, match=found):
         add_mission(ground, (TEXT + extra).encode())
     (tmp_path / "m.toml").write_text(TEXT + extra)
     mission, faults = check_mission_file(tmp_path / "m.toml")
@@ -316,7 +316,7 @@ def test_a_description_has_a_hundred_links_at_most():
     link = '[[links]]\nname = "l{}"\nkind = "file"\ndownlink = "/nowhere"\n'
     links = [link.format(k) for k in range(101)]
     assert len(read_mission((TEXT + "".join(links[1:])).encode())[0].links or ()) == 100
-    with pytest.raises(InvalidInput, match="at most 100 items"):
+    with raises(InvalidInput, match="at most 100 items"):
         read_mission((TEXT + "".join(links)).encode())
 
 
@@ -344,7 +344,7 @@ def test_a_check_tells_all_faults_or_what_changes_and_adds_nothing(ground):
     assert [one for one in found.changes if one[0] in "+-"] == ["-fov_deg = 120", "+fov_deg = 90"]
     assert len(check_mission(ground, (TEXT + "[linc]\n[camara]\n").encode()).faults) == 2
     other = Caller("eve", "operator", missions=("other",), spacecraft=frozenset({77}))
-    with pytest.raises(Forbidden):
+    with raises(Forbidden):
         check_mission(ground, TEXT.encode(), caller=other)
     with ground.database.reading() as connection:
         assert list_missions(connection, Paging()).total == 1
@@ -417,7 +417,7 @@ def test_several_that_enter_one_description_at_once_get_one_revision(either):
 
 
 def test_a_description_names_a_mission():
-    with pytest.raises(InvalidInput, match="name: expected"):
+    with raises(InvalidInput, match="name: expected"):
         parse_mission("schema_version = 1")
     assert Mission(name="x").unknown
 
@@ -430,10 +430,10 @@ longitude_deg = 0.0; latitude_deg = 95.0 | latitude_deg
 """
 
 
-@pytest.mark.parametrize("keys, expected", cells(IMPOSSIBLE))
+@mark.parametrize("keys, expected", cells(IMPOSSIBLE))
 def test_an_impossible_place_or_outage_of_a_station_is_refused(keys, expected):
     lines = keys.replace("; ", "\n")
-    with pytest.raises(InvalidInput, match=expected):
+    with raises(InvalidInput, match=expected):
         parse_mission(f'schema_version = 1\nname = "m"\n[link.stations.madrid]\n{lines}\n')
 
 
@@ -442,7 +442,7 @@ RULE = '[[automation.rules]]\nname = "a"\non = "window ended"\ndo = ["report"]\n
 PEOPLE = '[automation.channels.people]\nemail = ["a@b"]\n'
 
 
-@pytest.mark.parametrize("text, line",
+@mark.parametrize("text, line",
     [
         (RULE, "automation: expected no rules (the follow-up of an event is fixed, and alert rules are those of "
                "Prometheus), found automation.rules"),

@@ -1,7 +1,7 @@
 """Two spacecraft of different missions in one database; links and resources of a mission description."""
 
 import numpy as np
-import pytest
+from pytest import fixture, mark, raises
 
 from ground_service.contacts.commanding.service import enter_command
 from ground_service.errors import InvalidInput
@@ -64,7 +64,7 @@ median_error_m = 100
 """
 
 
-@pytest.fixture(scope="module")
+@fixture(scope="module")
 def made(make_pass):
     return make_pass(frames=24, seed=2)
 
@@ -178,7 +178,7 @@ def test_links_are_read_with_their_defaults_and_a_description_without_keeps_its_
     assert plain.revision == parse_mission(text("[resources]")).revision
 
 
-@pytest.mark.parametrize(
+@mark.parametrize(
     "parts, place, expected",
     [
         ((LINK.replace("10015", "99999"),), "links.0", "downlink as HOST:PORT, found '127.0.0.1:99999'"),
@@ -192,20 +192,20 @@ def test_links_are_read_with_their_defaults_and_a_description_without_keeps_its_
     ],
 )
 def test_a_fault_is_one_line_with_its_place(parts, place, expected):
-    with pytest.raises(InvalidInput) as refused:
+    with raises(InvalidInput) as refused:
         parse_mission(text(*parts), "mission.toml")
     message = str(refused.value)
     assert place in message and expected in message and "\n" not in message
 
 
 def test_links_need_a_spacecraft():
-    with pytest.raises(InvalidInput, match="a spacecraft id with links, found none"):
+    with raises(InvalidInput, match="a spacecraft id with links, found none"):
         parse_mission('name = "x"\n' + LINK)
 
 
 def test_two_spacecraft_cannot_use_the_same_link_name(ground):
     add_mission(ground, text(LINK).encode())
-    with pytest.raises(InvalidInput, match="'lab' of spacecraft 76"):
+    with raises(InvalidInput, match="'lab' of spacecraft 76"):
         add_mission(ground, text(LINK, number=77).encode())
     add_mission(ground, text(LINK, "[resources]\nbattery_wh = 60.0").encode())
     add_mission(ground, text(LINK.replace("lab", "other"), number=77).encode())

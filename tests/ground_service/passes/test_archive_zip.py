@@ -4,8 +4,7 @@ import stat
 import tracemalloc
 import zipfile
 
-import pytest
-from pytest import raises
+from pytest import mark, raises, warns
 
 from ground_service.errors import InvalidInput
 from ground_service.passes import archive_import
@@ -34,7 +33,7 @@ def test_a_zipped_archive_is_the_same_pass_as_its_folder(ground, synthetic_pass)
     assert not list(ground.home.glob(".unpacking-*"))
 
 
-@pytest.mark.parametrize("name", ["../evil", "/etc/evil", "a/../../evil", "..\\evil", "C:evil", "a" * 2000])
+@mark.parametrize("name", ["../evil", "/etc/evil", "a/../../evil", "..\\evil", "C:evil", "a" * 2000])
 def test_paths_that_lead_elsewhere_are_refused(ground, tmp_path, name):
     path = zipped(tmp_path / "bad.zip", {"manifest.json": b"{}", name: b"x"})
     refused(ground, path, "expected a plain file inside the archive")
@@ -56,7 +55,7 @@ def test_a_bomb_is_stopped_before_it_fills_the_disk(ground, tmp_path):
 
 
 def test_too_many_files_files_twice_and_no_zip_at_all_are_refused(ground, tmp_path, monkeypatch):
-    with pytest.warns(UserWarning, match="Duplicate name"), zipfile.ZipFile(tmp_path / "twice.zip", "w") as archive:
+    with warns(UserWarning, match="Duplicate name"), zipfile.ZipFile(tmp_path / "twice.zip", "w") as archive:
         archive.writestr("a", "1")
         archive.writestr("a", "2")
     refused(ground, tmp_path / "twice.zip", "expected each file once")
@@ -81,7 +80,7 @@ def with_directory(folder, entries, claimed):
     return folder / "many.zip"
 
 
-@pytest.mark.parametrize("claimed", [None, 1])
+@mark.parametrize("claimed", [None, 1])
 def test_a_great_directory_is_refused_before_it_is_read(ground, tmp_path, claimed):
     """The number of entries is counted in the directory, not taken from the end record."""
     entries = 1_200_000 if claimed is None else 25_000

@@ -58,7 +58,7 @@ def test_an_answer_is_kept_while_data_of_other_intervals_and_vehicles_come(archi
     assert archive.ask() == 1
 
 
-@pytest.mark.parametrize(("first", "last"), [(0, START), (STOP, STOP + 9), (None, None), (1200, 1300)])
+@pytest.mark.parametrize("first, last", [(0, START), (STOP, STOP + 9), (None, None), (1200, 1300)])
 def test_an_answer_is_made_again_with_new_data_of_its_interval(archive, first, last):
     assert archive.ask() == 1
     archive.telemetry(first, last)

@@ -4,7 +4,7 @@ import random
 import time
 
 import numpy as np
-import pytest
+from pytest import approx, fixture, mark, raises
 
 from ground_service.client.local import local_client
 from ground_service.clock import set_mission_clock
@@ -53,7 +53,7 @@ def defined(ground, start_utc_ns, stop_utc_ns, name="p"):
     return define_pass(ground, name=name, start_utc_ns=start_utc_ns, stop_utc_ns=stop_utc_ns, spacecraft_id=76)
 
 
-@pytest.fixture
+@fixture
 def passed(either, tmp_path):
     """Events of two passes, an hour each, and one between them."""
     given = [
@@ -104,9 +104,9 @@ def test_events_are_filtered_by_severity_name_and_time(passed):
 
 
 def test_events_and_parameters_of_an_unknown_spacecraft_are_not_found(ground):
-    with pytest.raises(NotFound, match="spacecraft 5"):
+    with raises(NotFound, match="spacecraft 5"):
         service.spacecraft_events(ground, EventFilter(spacecraft_id=5))
-    with pytest.raises(NotFound, match="spacecraft 5"):
+    with raises(NotFound, match="spacecraft 5"):
         live_parameters(ground, 5, "flight")
 
 
@@ -150,7 +150,7 @@ def test_the_newest_packet_by_on_board_time_counts(either, tmp_path):
     assert list_spacecraft(either)[0].name == "SelenITA"
 
 
-@pytest.mark.parametrize(("later_s", "age_s"), [(42.5, 42.5), (-1e8, 0.0)])
+@mark.parametrize("later_s, age_s", [(42.5, 42.5), (-1e8, 0.0)])
 def test_ages_are_those_of_mission_time_and_count_from_the_newest_packet_where_that_is_later(
     ground, tmp_path, later_s, age_s
 ):
@@ -237,7 +237,7 @@ def test_bursts_of_yesterday_in_todays_stream_fall_into_their_own_day(ground, tm
         assert (found.packets, found.lost, found.conflicts) == (FRAMES, 0, 0)
 
 
-@pytest.mark.parametrize(("share", "covered"), [(0.0, False), (0.5, True)])
+@mark.parametrize("share, covered", [(0.0, False), (0.5, True)])
 def test_a_reference_that_does_not_cover_gives_figures_where_it_does(ground, synthetic_pass, tmp_path, share, covered):
     whole = load_ephemeris(synthetic_pass.folder / "reference.oem")
     first, last = int(synthetic_pass.utc_ns[0]), int(synthetic_pass.utc_ns[-1])
@@ -251,7 +251,7 @@ def test_a_reference_that_does_not_cover_gives_figures_where_it_does(ground, syn
     key = defined(ground, first, last)
     figures = pass_summary(ground, key)["navigation"]
     found = figures.get("spherical", {"median_3d_m": None})["median_3d_m"]
-    assert found == (pytest.approx(130.0, abs=1.0) if covered else None)
+    assert found == (approx(130.0, abs=1.0) if covered else None)
     assert make_report(ground, key).report_id
 
 

@@ -3,9 +3,8 @@
 from dataclasses import replace
 
 import numpy as np
-import pytest
 from numpy.testing import assert_allclose, assert_array_equal
-from pytest import approx, raises
+from pytest import approx, fixture, mark, raises
 from sqlalchemy import event, select
 
 from ground_service.errors import InvalidInput, NotFound
@@ -50,7 +49,7 @@ COUNT = 4000
 ALWAYS = (0, (1 << 48) - 1)
 
 
-@pytest.fixture(scope="module")
+@fixture(scope="module")
 def columns():
     """Samples of two estimators every 5 s with two silences; some values unknown, two samples at one time."""
     rng = np.random.default_rng(1)
@@ -68,7 +67,7 @@ def columns():
     }  # fmt: skip
 
 
-@pytest.fixture
+@fixture
 def vehicle(ground, columns):
     """A spacecraft with these samples."""
     return stored(ground, columns, [np.arange(COUNT)])
@@ -101,16 +100,16 @@ def rollup_statistics(ground):
     return [tuple(row[:-1]) for row in rows], np.frombuffer(b"".join(row[-1] for row in rows), "<f8")
 
 
-@pytest.fixture
+@fixture
 def few(monkeypatch):
     """Few samples are read from roll-ups too."""
     monkeypatch.setattr(series, "FEW_ROWS", 10)
     monkeypatch.setattr(series, "COARSE", 10**9)
 
 
-@pytest.mark.usefixtures("few")
-@pytest.mark.parametrize("coarse", [0, 10**9], ids=["samples", "roll-ups"])
-@pytest.mark.parametrize(("skip", "drop"), [(0, 0), (333, 200)])
+@mark.usefixtures("few")
+@mark.parametrize("coarse", [0, 10**9], ids=["samples", "roll-ups"])
+@mark.parametrize("skip, drop", [(0, 0), (333, 200)])
 def test_a_series_of_samples_or_roll_ups_holds_every_sample_once_and_is_as_fine_as_asked_for(
     ground, columns, vehicle, skip, drop, coarse, monkeypatch
 ):
@@ -135,7 +134,7 @@ def test_a_series_of_samples_or_roll_ups_holds_every_sample_once_and_is_as_fine_
     assert (whole.stop_utc_ns - whole.start_utc_ns).max() < span / 10
 
 
-@pytest.mark.usefixtures("few")
+@mark.usefixtures("few")
 def test_silences_are_marked(ground, vehicle):
     found = read(ground, (vehicle, *ALWAYS), points=2000).buckets
     after = np.flatnonzero(found.after_gap)
@@ -143,7 +142,7 @@ def test_silences_are_marked(ground, vehicle):
     assert len(after) == 2 and (silence_s > 3900.0).all()
 
 
-@pytest.mark.usefixtures("vehicle")
+@mark.usefixtures("vehicle")
 def test_late_data_and_split_batches_give_the_same_roll_ups(ground, columns, tmp_path):
     order = np.random.default_rng(5).permutation(COUNT)
     with open_ground(tmp_path / "other") as other:
@@ -237,7 +236,7 @@ def anchored_packets(made, version):
     return packets
 
 
-@pytest.fixture(params=[2, 3])
+@fixture(params=[2, 3])
 def flown(request, tmp_path, make_pass):
     made = make_pass(frames=8, seed=3)
     path = tmp_path / "anchored.cadu"
@@ -336,7 +335,7 @@ def large_data(octets, transaction, ticks, table="thumbnail"):
     ]
 
 
-@pytest.fixture
+@fixture
 def receive(ground, tmp_path):
     def run(*packets):
         file = tmp_path / "downlink.cadu"

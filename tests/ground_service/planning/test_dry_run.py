@@ -2,7 +2,7 @@
 
 import json
 
-import pytest
+from pytest import fixture, mark
 
 from ground_service.errors import Stopping
 from ground_service.ground import Ground
@@ -21,12 +21,12 @@ CRITICAL = ("perform_function/set_mode", "uplink_first", "uplink_middle", "uplin
 REQUEST = {"name": "low Sun", "spacecraft_id": 76, "windows": 2, "period_days": 7.0, "horizon_days": 1.0}
 
 
-@pytest.fixture(scope="module")
+@fixture(scope="module")
 def oem(tmp_path_factory):
     return save_circle(tmp_path_factory.mktemp("oem") / "reference.oem", START, 30.0)
 
 
-@pytest.fixture
+@fixture
 def flown(tmp_path, oem):
     """A function that writes the files and makes the dry run."""
 
@@ -46,8 +46,8 @@ def test_a_description_that_flies_has_windows_with_telecommands(flown):
     assert [len(one.telecommands) for one in found.windows] == [5, 5]
 
 
-@pytest.mark.parametrize(
-    ("extra", "request_changes", "fault"),
+@mark.parametrize(
+    "extra, request_changes, fault",
     [
         (
             AUTOMATIC + UPLOADS + LINKS,
@@ -119,7 +119,7 @@ def test_a_text_is_rehearsed_with_the_requests_and_ephemerides_of_the_service(gr
     assert rehearse() == (0, (TOO_LONG,))
 
 
-@pytest.mark.parametrize("place", [1, 2, 4])  # a request, a day of its horizon, the release of a window
+@mark.parametrize("place", [1, 2, 4])  # a request, a day of its horizon, the release of a window
 def test_a_dry_run_that_takes_too_long_ends(flown, monkeypatch, place):
     asked = []
 

@@ -5,9 +5,9 @@ import math
 from dataclasses import replace
 
 import numpy as np
-import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from pytest import approx, fixture, mark, raises
 
 from ground_service.access.model import AuditFilter
 from ground_service.access.store import list_audit
@@ -55,7 +55,7 @@ def test_curves_fill_and_empty_battery_and_storage():
     assert empty.battery_wh.tolist() == [10.0, 2.0, 0.0, 5.0]  # not below empty
 
 
-@pytest.fixture
+@fixture
 def planned(ground, synthetic_pass):
     """A service with an ephemeris of half an hour and a mission of small resources."""
     add_mission(ground, MISSION.format(catalogue="").encode(), actor="ann")
@@ -79,11 +79,11 @@ def test_a_forecast_has_the_conditions_of_the_ephemeris_and_the_resources_of_the
     assert found.time_s[0] == START / NS + 30.0
     for name in ("latitude_deg", "sunlit", "battery_share", "stored_octets", "sent_octets", "downlink_octets"):
         assert len(getattr(found, name)) == 10
-    assert found.altitude_km == pytest.approx([30.0] * 10, abs=0.1)
+    assert found.altitude_km == approx([30.0] * 10, abs=0.1)
     assert found.battery_floor == 0.5 and found.storage_octets == 1 << 20
     # 6 W of 20 Wh from where the ephemeris begins, ten minutes before.
     hours = (10 + np.arange(1, 11)) / 60.0
-    assert found.battery_share == pytest.approx((1.0 - 6.0 * hours / 20.0).tolist(), abs=2e-3)
+    assert found.battery_share == approx((1.0 - 6.0 * hours / 20.0).tolist(), abs=2e-3)
     assert found.conflicts == [] and found.reason is None
 
 
@@ -105,9 +105,9 @@ def test_windows_lower_the_battery_and_fill_the_storage(planned):
     octets = planned.read(get_window, enter(planned, 60, 180)).data_octets
     after = shown(planned)
     drop = np.array(before.battery_share) - np.array(after.battery_share)
-    assert drop.tolist() == pytest.approx([0.0, 0.05] + [0.1] * 8, abs=2e-3)  # 60 W for two minutes of 20 Wh
+    assert drop.tolist() == approx([0.0, 0.05] + [0.1] * 8, abs=2e-3)  # 60 W for two minutes of 20 Wh
     # Half of the data come in each minute; a contact takes them in the next one.
-    assert after.stored_octets[:4] == pytest.approx([0, octets / 2, octets / 2, 0], abs=1)
+    assert after.stored_octets[:4] == approx([0, octets / 2, octets / 2, 0], abs=1)
     assert after.assumed == []
     assert sum(after.sent_octets) <= octets
 
@@ -119,9 +119,9 @@ def test_an_interval_without_an_ephemeris_states_the_reason(planned):
     assert 0 < len(partly.time_s) < 86_400 / 60 and "ephemeris reference covers" in (partly.reason or "")
 
 
-@pytest.mark.parametrize("stop_s", [0.0, -5.0, 8.1 * 86_400])
+@mark.parametrize("stop_s", [0.0, -5.0, 8.1 * 86_400])
 def test_an_empty_or_too_long_interval_is_an_error(planned, stop_s):
-    with pytest.raises(InvalidInput, match="at most 8 days"):
+    with raises(InvalidInput, match="at most 8 days"):
         shown(planned, 0.0, stop_s)
 
 
@@ -144,13 +144,13 @@ def test_craters_are_counted_by_area_and_searched_for(planned, tmp_path):
     rows = np.array(found.rows)
     assert rows.shape == (18, 36) and np.count_nonzero(rows) == 2
     cell_km2 = 1737.4**2 * math.radians(10.0) * math.sin(math.radians(10.0))
-    assert rows[9, 18] == pytest.approx(2 / cell_km2 * 1e4, abs=0.01)  # the crater of 60 km does not count
+    assert rows[9, 18] == approx(2 / cell_km2 * 1e4, abs=0.01)  # the crater of 60 km does not count
     assert rows[17, 17] > rows[9, 18] / 2  # one crater in a smaller cell
 
 
 def test_a_catalogue_without_a_crater_is_refused(ground):
     stored = ground.files.put_octets(b"id,latitude_deg,longitude_deg,diameter_m,depth_m\n")
-    with pytest.raises(InvalidInput, match=r"catalogue: expected a crater catalogue, found none\.csv: no crater$"):
+    with raises(InvalidInput, match=r"catalogue: expected a crater catalogue, found none\.csv: no crater$"):
         add_catalogue(ground, stored, "none.csv")
 
 
@@ -160,12 +160,12 @@ def test_a_withdrawn_catalogue_is_not_used_and_can_be_held_again(ground, tmp_pat
     add_catalogue(ground, stored, "one.csv")
     text = MISSION.format(catalogue=f'[catalogue]\nsha256 = "{stored.sha256}"\n')
     add_mission(ground, text.encode(), actor="ann")
-    with pytest.raises(Conflict, match="is that of the mission of spacecraft 76"):
+    with raises(Conflict, match="is that of the mission of spacecraft 76"):
         withdraw_catalogue(ground, stored.sha256, actor="ann")
     add_mission(ground, MISSION.format(catalogue="").encode(), actor="ann")
     withdraw_catalogue(ground, stored.sha256, actor="ann")
     assert ground.read(list_audit, AuditFilter()).items[0].action == "withdraw catalogue"
-    with pytest.raises(NotFound):
+    with raises(NotFound):
         withdraw_catalogue(ground, stored.sha256, actor="ann")
     add_mission(ground, text.replace("small", "again").encode(), actor="ann")
     assert "a catalogue that the ground holds" in (forecast.crater_density(ground, 76).reason or "")
@@ -217,7 +217,7 @@ def test_the_battery_is_that_of_a_balance_by_hand_whatever_the_steps():
     assert why(grid(), (1, 2), (3 + 14 / 3 - 0.5, 2.5)) is not None
     for start in (0.0, 0.1, 1.05, 23.0):
         change, _ = grid().flows([window(start, 0.75)])
-        assert (grid().gain_wh - change).sum() == pytest.approx(15.0)
+        assert (grid().gain_wh - change).sum() == approx(15.0)
 
 
 def test_stored_data_leave_in_contacts():

@@ -6,7 +6,7 @@ from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
-import pytest
+from pytest import approx, fixture, mark, raises
 
 from ground_service.access.model import AuditFilter
 from ground_service.access.store import list_audit
@@ -139,7 +139,7 @@ def test_craters_are_counted_in_the_camera(make_pass):
     assert abs(middle - (START + 38 * NS)) < 60 * NS
 
 
-@pytest.mark.parametrize(("duration_s", "frames"), [(90.0, 6), (90.1, 7), (104.9, 7), (5.0, 1)])
+@mark.parametrize("duration_s, frames", [(90.0, 6), (90.1, 7), (104.9, 7), (5.0, 1)])
 def test_an_observation_has_a_frame_at_its_start_and_none_at_its_stop(duration_s, frames):
     assert frames_between(START, START + round(duration_s * NS), 15.0) == frames
 
@@ -166,7 +166,7 @@ def test_the_battery_falls_with_the_load():
     assert all(one.start_utc_ns < one.stop_utc_ns for one in rejected)
     strong = search(planner(circle(), generation_w=1000.0), maximum_duration_s=3600.0, sunlit=True)
     assert all(candidate.battery_minimum > 0.85 for candidate in strong.candidates)
-    assert strong.candidates[0].energy_wh == pytest.approx(
+    assert strong.candidates[0].energy_wh == approx(
         8.0 * (strong.candidates[0].stop_utc_ns - strong.candidates[0].start_utc_ns) / NS / 3600.0
     )
 
@@ -221,7 +221,7 @@ approved downlinked command_states=SENT, frames=9, received_after=True, lost=0
 approved processed command_states=SENT, frames=9, received_after=True, lost=0, reported=True"""
 
 
-@pytest.mark.parametrize("row", STATES.splitlines())
+@mark.parametrize("row", STATES.splitlines())
 def test_the_state_follows_from_the_facts(row):
     decision, expected, facts = f"{row} ".split(" ", 2)
     state, reason = state_of(WindowEvidence(decision, **eval(f"dict({facts})")))
@@ -251,7 +251,7 @@ def test_a_window_outside_the_ephemerides_has_no_prediction_and_is_refused_if_it
     predicted = add_window(ground, window(), actor="ann").predicted
     assert (predicted.frames, predicted.battery_minimum, predicted.downlinked_by) == (40, None, None)
     for key in (named, None):
-        with pytest.raises(PlanConflicts, match="expected a time that a reference ephemeris covers"):
+        with raises(PlanConflicts, match="expected a time that a reference ephemeris covers"):
             add_window(ground, window(key), actor="ann")
         add_mission(ground, (MISSION + "[uploads]\n").encode())
 
@@ -261,7 +261,7 @@ def test_an_ephemeris_that_gravity_does_not_move_is_refused_with_the_acceleratio
     metres = replace(one, position_m=1e3 * one.position_m, velocity_m_s=1e3 * one.velocity_m_s)
     save_oem(Ephemeris((metres,)), tmp_path / "m.oem")
     message = r"ephemeris, states of SELENITA: expected an acceleration of \S+ m/s2 .* found .*metres for kilo"
-    with pytest.raises(InvalidInput, match=message):
+    with raises(InvalidInput, match=message):
         add_ephemeris(ground, ground.files.put_file(tmp_path / "m.oem"), name="metres")
     assert add_ephemeris(ground, ground.files.put_file(tmp_path / "km.oem"), name="km").states == 240
 
@@ -272,7 +272,7 @@ def test_an_ephemeris_belongs_to_a_spacecraft_and_can_be_withdrawn(ground, synth
     own = add_ephemeris(ground, ground.files.put_file(synthetic_pass.folder / "reference.oem"), name="own")
     add_mission(ground, (MISSION + 'name = "SelenITA"\n').encode())
     other = ground.files.put_file(tmp_path / "other.oem")
-    with pytest.raises(InvalidInput, match=r"OBJECT_NAME: expected a spacecraft .* \(SelenITA, .*, found OTHER"):
+    with raises(InvalidInput, match=r"OBJECT_NAME: expected a spacecraft .* \(SelenITA, .*, found OTHER"):
         add_ephemeris(ground, other, name="other", precedence=9)
     add_mission(ground, b'name = "second"\n[spacecraft]\nid = 77\nobject_names = ["Other"]\n')
     foreign = add_ephemeris(ground, other, name="other", precedence=9)
@@ -310,7 +310,7 @@ def ticks_of(utc_ns):
     return 1_000_000 + (utc_ns - BEGIN + 7 * NS) * 65_536 // NS
 
 
-@pytest.fixture(scope="module")
+@fixture(scope="module")
 def reference():
     times = np.arange(BEGIN - 3_600 * NS, STOP + 3_600 * NS, 30 * NS)
     angle = 2.0 * np.pi * (times - BEGIN) / (6_672.0 * NS)
@@ -373,7 +373,7 @@ def test_a_window_of_the_experiment_starts_from_the_stated_error_with_its_declar
     activities, state = prepared(reference, stated, again)
     initial = unpack_initial_state(loaded(activities)[9])
     assert state is again and initial.sigma_position_m == 1_000.0
-    assert initial.sigma_velocity_m_s == pytest.approx(0.9417, rel=5e-3)
+    assert initial.sigma_velocity_m_s == approx(0.9417, rel=5e-3)
     np.testing.assert_allclose(initial.position_icrf_m, again.position_icrf_m, atol=1e-3)
 
 
@@ -395,5 +395,5 @@ def test_without_tables_only_the_mode_changes():
 
 def test_a_window_without_a_reference_that_covers_it_is_refused(reference):
     for ephemeris, late in ((None, 0), (reference, 7_800 * NS)):
-        with pytest.raises(Conflict, match="its tables need a reference ephemeris"):
+        with raises(Conflict, match="its tables need a reference ephemeris"):
             prepared(ephemeris, late=late)

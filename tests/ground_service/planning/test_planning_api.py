@@ -1,6 +1,6 @@
 """Windows over the interface: searched, entered, decided on, uplinked, followed by telemetry, exchanged."""
 
-import pytest
+from pytest import fixture, mark
 
 from ground_service.app import create_app
 from ground_service.passes.span import ObservationSpan, Planned, belongs_to
@@ -21,7 +21,7 @@ def at(seconds):
     return format_utc(START + int(seconds * NS), 0)
 
 
-@pytest.fixture
+@fixture
 def client(synthetic_pass, tmp_path, monkeypatch):
     """A service with the reference ephemeris of the synthetic pass and nothing else, not even public data."""
     monkeypatch.delenv("LINNA_DATA", raising=False)
@@ -201,7 +201,7 @@ def telemetry(frames=5):
     return sent.packets
 
 
-@pytest.mark.parametrize("order", [(0, 1, 2), (2, 0, 1)])
+@mark.parametrize("order", [(0, 1, 2), (2, 0, 1)])
 def test_the_state_follows_telemetry_in_whatever_order_it_comes(client, order):
     key = approved(client, 60, 120)
     sent(client, key)
@@ -220,8 +220,8 @@ def test_the_state_follows_telemetry_in_whatever_order_it_comes(client, order):
     assert shown(client, key)["state"] == "processed"
 
 
-@pytest.mark.parametrize(
-    ("received", "last_s", "expected"),
+@mark.parametrize(
+    "received, last_s, expected",
     [
         ((8, 9), 600, "failed"),  # nothing is missing
         ((1, 9), 600, "uplinked"),

@@ -7,7 +7,7 @@ from itertools import pairwise
 from unittest.mock import MagicMock
 
 import numpy as np
-import pytest
+from pytest import approx, fixture, raises
 
 from ground_service.contacts.commanding.model import TelecommandFilter
 from ground_service.contacts.commanding.service import get_command, list_telecommands, take_uplink
@@ -71,7 +71,7 @@ uplink = "127.0.0.1:9"
 AUTOMATIC = '[approval]\nwindows = "automatic"\n'
 
 
-@pytest.fixture(params=["sqlite", "postgresql"])
+@fixture(params=["sqlite", "postgresql"])
 def either(request, tmp_path, oem):
     """A service with an ephemeris on each database, which does not follow its events: only the tests plan."""
     url = request.getfixturevalue("migrated_postgres")() if request.param == "postgresql" else None
@@ -80,7 +80,7 @@ def either(request, tmp_path, oem):
         yield opened
 
 
-@pytest.fixture
+@fixture
 def ground(tmp_path, oem):
     """As `either`, on SQLite."""
     with open_ground(tmp_path / "home") as opened:
@@ -88,7 +88,7 @@ def ground(tmp_path, oem):
         yield opened
 
 
-@pytest.fixture(scope="module")
+@fixture(scope="module")
 def oem(tmp_path_factory):
     path = tmp_path_factory.mktemp("oem") / "reference.oem"
     return save_circle(path, START - 3 * HOUR, 24.0 * DAYS)
@@ -294,7 +294,7 @@ def test_windows_keep_the_limits_of_images(ground, now):
     assert "excluded by latitude limit of the mission description 50 deg, regions" in reason
     start = windows[0].start.utc_ns + HOUR // 2
     entry = WindowEntry("pole", start, start + HOUR, 15.0, 76)
-    with pytest.raises(PlanConflicts, match="expected latitudes within the 50 deg of the mission description"):
+    with raises(PlanConflicts, match="expected latitudes within the 50 deg of the mission description"):
         planning.add_window(ground, entry, actor="ann")
 
 
@@ -314,14 +314,14 @@ def test_paused_and_deleted_requests_are_not_planned(ground, now):
     assert plan(ground, now)["added"] == 1
     standing.delete_request(ground, key, actor="ann")
     assert [one.request_id for one in windows_of(ground)] == [None]
-    with pytest.raises(NotFound):
+    with raises(NotFound):
         ground.read(get_request, key)
 
 
 def test_contradictory_terms_are_refused(ground):
-    with pytest.raises(InvalidInput, match="minimum_duration_s: expected at most maximum_duration_s"):
+    with raises(InvalidInput, match="minimum_duration_s: expected at most maximum_duration_s"):
         request(ground, minimum_duration_s=900.0, maximum_duration_s=600.0)
-    with pytest.raises(InvalidInput, match="stop: expected a time after the start"):
+    with raises(InvalidInput, match="stop: expected a time after the start"):
         request(ground, start="2029-08-07T00:00:00Z", stop="2029-08-06T00:00:00Z")
 
 
@@ -384,16 +384,16 @@ def verified(ground, window, after, outcome="verification_completed"):
 
 def test_a_window_that_has_begun_is_neither_entered_nor_approved_nor_released(either, now):
     add_mission(either, NAMED)
-    with pytest.raises(PlanConflicts, match="expected a start after the mission time 2029-08-07T06:00:00"):
+    with raises(PlanConflicts, match="expected a start after the mission time 2029-08-07T06:00:00"):
         add(either, START)
     window = add(either)
     now.utc_ns += 61 * MINUTE
-    with pytest.raises(PlanConflicts, match="expected a start after the mission time"):
+    with raises(PlanConflicts, match="expected a start after the mission time"):
         decided(either, window, "approved")
     now.utc_ns = START
     decided(either, window, "approved")
     now.utc_ns += 61 * MINUTE
-    with pytest.raises(Conflict, match=r"began at 2029-08-07T07:00:00.*its telecommands are not sent"):
+    with raises(Conflict, match=r"began at 2029-08-07T07:00:00.*its telecommands are not sent"):
         planning.uplink_window(either, window.id, actor="ann")
 
 
@@ -424,17 +424,17 @@ def test_candidates_in_the_past_are_not_offered(ground, tmp_path, now):
     found = planning.search_windows(ground, WindowSearch())
     assert found.candidates and min(one.start.utc_ns for one in found.candidates) >= now.utc_ns
     now.utc_ns += 86_400 * NS
-    with pytest.raises(Conflict, match="expected a span that ends after the mission time"):
+    with raises(Conflict, match="expected a span that ends after the mission time"):
         planning.search_windows(ground, WindowSearch())
 
 
 def test_a_spacecraft_without_a_description_is_not_planned(either, now):
     add_mission(either, NAMED)
-    with pytest.raises(Conflict, match=r"spacecraft 77: .*states \(76\), found none"):
+    with raises(Conflict, match=r"spacecraft 77: .*states \(76\), found none"):
         add(either, spacecraft=77)
-    with pytest.raises(Conflict, match=r"spacecraft 77"):
+    with raises(Conflict, match=r"spacecraft 77"):
         planning.search_windows(either, WindowSearch(spacecraft_id=77))
-    with pytest.raises(Conflict, match=r"spacecraft 77"):
+    with raises(Conflict, match=r"spacecraft 77"):
         get_forecast(either, spacecraft_id=77, instance="flight", start_utc_ns=START, stop_utc_ns=START + MINUTE)
 
 
@@ -446,7 +446,7 @@ def test_a_window_on_board_is_cancelling_until_its_activities_are_deleted(either
     deleted = [one.arguments["request_id"] for one in commands if one.name == "delete_activity"]
     assert deleted == [one.request_id for one in commands if one.carrier_id is not None]
     assert len(deleted) == 2
-    with pytest.raises(Conflict):  # it still has its time
+    with raises(Conflict):  # it still has its time
         decided(either, add(either), "approved")
     take_uplink(either, spacecraft_id=76, actor="ann")
     receive(either, *verified(either, window, int(ticks_from_utc_ns(START + MINUTE))))
@@ -478,7 +478,7 @@ def test_a_window_that_has_begun_on_board_cannot_be_cancelled(either, now):
     now.utc_ns += 61 * MINUTE
     for state in ("uplinked", "executing"):
         assert either.read(get_window, window.id).state == state
-        with pytest.raises(Conflict, match="too late to delete its activities; perform_function stop_observation"):
+        with raises(Conflict, match="too late to delete its activities; perform_function stop_observation"):
             decided(either, window, "failed")
         receive(either, event_packet(int(ticks_from_utc_ns(window.start.utc_ns)), 0, "observation_started"))
 
@@ -507,6 +507,6 @@ def test_a_search_goes_around_a_hole_or_takes_the_ephemeris_that_has_none(ground
 
 def test_a_first_window_is_as_long_as_the_error_of_its_coast_requires():
     """1,650 km s over the duration: 3 km need 550 s, and a longer stated duration stays."""
-    assert WindowSearch(first_coast_m=3_000.0).constraints().minimum_duration_s == pytest.approx(550.0)
+    assert WindowSearch(first_coast_m=3_000.0).constraints().minimum_duration_s == approx(550.0)
     assert WindowSearch(first_coast_m=1e6).constraints().minimum_duration_s == 300.0
     assert WindowSearch().constraints().minimum_duration_s == 300.0

@@ -8,9 +8,8 @@ import threading
 from unittest.mock import MagicMock
 
 import numpy as np
-import pytest
 from PIL import Image
-from pytest import raises
+from pytest import approx, fixture, mark, raises
 
 from ground_service.client.local import local_client
 from ground_service.errors import InvalidInput
@@ -55,12 +54,12 @@ def good(ground, make_build, packets):
     return register_build(ground, load_build(make_build("good", packets)))
 
 
-@pytest.fixture(scope="module")
+@fixture(scope="module")
 def archive(make_pass):
     return make_pass(frames=4, seed=3)
 
 
-@pytest.fixture(scope="module")
+@fixture(scope="module")
 def flown(make_flyable):
     return make_flyable(frames=4, seed=5)
 
@@ -141,7 +140,7 @@ def test_a_pass_without_telemetry_has_no_archive(ground):
         keep_pass(ground, pass_id)
 
 
-@pytest.fixture
+@fixture
 def unrendered(flown, tmp_path):
     """An archive without two of its frames, whose scenario is not one."""
     folder = shutil.copytree(flown.folder, tmp_path / "unrendered")
@@ -151,7 +150,7 @@ def unrendered(flown, tmp_path):
     return folder
 
 
-@pytest.fixture
+@fixture
 def render_whole(flown, monkeypatch):
     """From its call on, rendering an archive gives the flown one."""
 
@@ -200,8 +199,8 @@ def test_a_pass_without_frames_does_not_change_the_verdict_on_the_others(ground,
     assert [repr(gate) for gate in outcome.gates] == [repr(gate) for gate in alone.gates]
 
 
-@pytest.mark.parametrize(
-    ("words", "limit", "found"),
+@mark.parametrize(
+    "words, limit, found",
     [
         (("sleep", "9"), {"wall_s": 1}, "timeout"),
         (("{python}", "-c", "import sys; sys.exit('linna: error: x')"), {}, "exit status 1"),
@@ -323,7 +322,7 @@ def test_a_placebo_sees_images_with_noise_of_its_seed_and_their_hashes(flown, tm
     assert hashes[0] == hashes[1] != hashes[2]
     one, _, other = (image - 90.0 for image in images)
     # Noise of 1 DN, rounded: variance 1 + 1/12.
-    assert np.var(one) == pytest.approx(13 / 12, rel=0.02) == np.var(other)
+    assert np.var(one) == approx(13 / 12, rel=0.02) == np.var(other)
     assert abs(np.corrcoef(one.ravel(), other.ravel())[0, 1]) < 0.01
 
 

@@ -7,8 +7,7 @@ import time
 import venv
 from pathlib import Path
 
-import pytest
-from pytest import raises
+from pytest import fixture, mark, raises
 
 from ground_service.errors import BuildNotChecked, InvalidInput
 from ground_service.http.model import Paging, UtcTime
@@ -24,12 +23,12 @@ from linna.cli import run as run_command
 LIMITS = "\n[limits]\nwall_s = 20\ncpu_s = 10\nmemory_mib = 300\nfile_mib = 4\nfolder_mib = 12\n"
 
 
-@pytest.fixture(scope="module")
+@fixture(scope="module")
 def archive(make_flyable):
     return make_flyable(frames=2, seed=31).folder
 
 
-@pytest.fixture
+@fixture
 def fly(make_build, archive, tmp_path):
     def run(program, limits=LIMITS):
         build = load_build(make_build("bad", program="import os, pathlib, sys, time\n" + program, extra=limits))
@@ -92,8 +91,8 @@ def test_a_program_that_makes_too_many_files_is_stopped(fly, monkeypatch):
     assert run.outcome == "disk"
 
 
-@pytest.mark.parametrize(
-    ("program", "outcome", "message"),
+@mark.parametrize(
+    "program, outcome, message",
     [
         ("os.kill(os.getpid(), 11)", "crashed", "11"),
         ("while True: pass", "cpu", ""),
@@ -208,7 +207,7 @@ name = "x" | command = ["x", "{archive}", "{out}"] | model = "m" -> expected a c
 """
 
 
-@pytest.mark.parametrize("row", WRONG_BUILDS.strip().split("\n"))
+@mark.parametrize("row", WRONG_BUILDS.strip().split("\n"))
 def test_a_bad_build_file_is_refused_with_its_key(row, tmp_path):
     text, message = row.replace("0xF", f"0x{'f' * 5000}").split(" -> ")
     file = tmp_path / "build.toml"
@@ -257,7 +256,7 @@ def test_what_differs_between_two_builds_on_the_flight_code_is_named(tmp_path, m
     assert changes(good, load_build(make_build("program", program="pass"))) == []
 
 
-@pytest.fixture
+@fixture
 def write(tmp_path):
     def build(parameters):
         (tmp_path / "p.toml").write_text(parameters)
@@ -267,8 +266,8 @@ def write(tmp_path):
     return build
 
 
-@pytest.mark.parametrize(
-    ("text", "message"),
+@mark.parametrize(
+    "text, message",
     [
         (
             "flight.anchored.gravity_degre = 60",
@@ -308,8 +307,8 @@ def _ended(**changes):
     return run
 
 
-@pytest.mark.parametrize(
-    ("run", "message"),
+@mark.parametrize(
+    "run, message",
     [
         (_refused, "no user namespaces"),
         (_ended(exit_status=1), "status 1: MemoryError"),

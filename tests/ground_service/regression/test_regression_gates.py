@@ -3,8 +3,7 @@
 from dataclasses import replace
 
 import numpy as np
-import pytest
-from pytest import approx
+from pytest import approx, mark
 
 from ground_service.evaluation.recall import ExpectedCraters
 from ground_service.regression.gates.calibration import calibrations, gate_noise, pass_noise
@@ -140,15 +139,15 @@ def largest_count(trials, rate):
     return int(stats.binom.isf(1e-4, trials, rate))
 
 
-@pytest.mark.parametrize("passes", [1, 5])
+@mark.parametrize("passes", [1, 5])
 def test_equal_builds_fail_once_in_a_hundred_at_most_and_pass_on_five_windows(passes):
     outcomes = [verdict_of(judge(suite(0, passes, 100 * k), suite(1, passes, 100 * k), POLICY)) for k in range(100)]
     assert outcomes.count("fail") <= largest_count(100, 0.01)
     assert outcomes.count("pass") >= 95
 
 
-@pytest.mark.parametrize(
-    ("passes", "faults", "name"),
+@mark.parametrize(
+    "passes, faults, name",
     [
         (1, {"recall": 0.5}, "detector.recall"),
         (5, {"recall": 0.65, "false_cells": 11}, "detector.recall"),
@@ -305,7 +304,7 @@ def wrong(passes, count):
     return changed(passes, estimators={"anchored": replace(of, wrong=(np.arange(FRAMES) < count) * 1.0)})
 
 
-@pytest.mark.parametrize(("name", "fault", "reason"), EXACT)
+@mark.parametrize("name, fault, reason", EXACT)
 def test_a_gross_failure_on_one_pass_fails_in_one_sentence(name, fault, reason):
     before = suite(0, 1, 1, **TIMES)
     after = wrong(before, fault["wrong"]) if "wrong" in fault else changed(before, **fault)
@@ -442,8 +441,8 @@ def test_levels_are_shared_by_weight_and_between_all_passes_and_parts():
     )
 
 
-@pytest.mark.parametrize(
-    ("outcomes", "verdict"),
+@mark.parametrize(
+    "outcomes, verdict",
     [
         ("", "inconclusive"),
         ("pass", "pass"),
@@ -552,7 +551,7 @@ def test_the_error_of_a_ratio_is_that_of_a_mean_without_differences_between_kind
     assert (change.estimate, change.error, change.units) == (0.5, approx(1.8 / 100), 100)
 
 
-@pytest.mark.parametrize("correlated", [False, True])
+@mark.parametrize("correlated", [False, True])
 def test_a_one_sided_test_is_wrong_as_often_as_it_says(correlated):
     """400 pairs of equal builds, rows of a track alike or independent, at 5 %."""
     rng, wrong = np.random.default_rng(3), 0

@@ -9,8 +9,7 @@ from pathlib import Path
 from unittest.mock import MagicMock
 
 import numpy as np
-import pytest
-from pytest import approx
+from pytest import MonkeyPatch, approx, fixture, mark, raises
 from sqlalchemy import select
 
 from ground_service.client.local import local_client
@@ -96,34 +95,34 @@ def with_detections(packets, change):
     return altered(packets, changed)
 
 
-@pytest.fixture(scope="module")
+@fixture(scope="module")
 def passes(make_flyable):
     return [make_flyable(frames=30, seed=seed, filter_nis=3.0) for seed in (41, 42)]
 
 
-@pytest.fixture(scope="module")
+@fixture(scope="module")
 def first(passes):
     return passes[0].folder
 
 
-@pytest.fixture(scope="module")
+@fixture(scope="module")
 def packets(passes):
     return {f"synthetic pass {seed}": one.packets for seed, one in zip((41, 42), passes, strict=True)}
 
 
-@pytest.fixture(scope="module")
+@fixture(scope="module")
 def home(tmp_path_factory):
     """A service shared by the tests of this file: replays of the good build are done once."""
     with open_ground(tmp_path_factory.mktemp("regressions")) as ground:
         yield ground
 
 
-@pytest.fixture
+@fixture
 def policy():
     return load_policy()
 
 
-@pytest.fixture
+@fixture
 def judge(home, passes, packets, make_build, policy):
     """Hold a build that sends these packets against the build that flew."""
 
@@ -190,8 +189,8 @@ def test_processor_times_are_compared_only_of_replays_at_the_same_time(judge, mo
     assert {gate.name for gate in again.gates if gate.name.startswith("latency.")} >= failed(again) >= {"latency.total"}
 
 
-@pytest.mark.parametrize(
-    ("fault", "message"),
+@mark.parametrize(
+    "fault, message",
     [
         (late_headers, "contradict the image or step that they report, by up to 7.0 s"),
         (late_states, "navigation_state packets name a time at which no image was taken"),
@@ -213,8 +212,8 @@ def test_packets_out_of_order_fail_in_one_sentence(judge, packets):
     assert "packets more than in the baseline are out of order in time" in verdict_document(outcome).headline
 
 
-@pytest.mark.parametrize(
-    ("program", "message"),
+@mark.parametrize(
+    "program, message",
     [
         ("raise SystemExit('no network found')", "candidate crashed: exit status 1: no network found"),
         ("import time; time.sleep(60)", "candidate hung: stopped at its time limit"),
@@ -247,7 +246,7 @@ def test_a_build_that_fails_on_one_pass_is_judged_on_the_others(judge, packets):
     assert outcome.verdict == "fail"
 
 
-@pytest.fixture
+@fixture
 def copy(first, tmp_path):
     return shutil.copytree(first, tmp_path / "copy")
 
@@ -264,7 +263,7 @@ def test_a_placebo_leaves_the_noise_of_its_metrics_and_marks_gates_that_reject_e
     recall = [one for one in outcome.noise if one.metric == "detector.recall"]
     assert [(one.loss, one.condition.split(", ")[1]) for one in recall] == 2 * [(0.0, "above 25 km")]
     assert home.read(replays) == before
-    with pytest.MonkeyPatch.context() as patched:
+    with MonkeyPatch.context() as patched:
         patched.setattr("ground_service.regression.service.publish", publish := MagicMock())
         keep_regression(home, outcome)
     publish.assert_not_called()  # nobody is notified
@@ -410,7 +409,7 @@ def test_the_report_shows_the_craters_that_changed_side_by_side(home, judge, pac
     outcome = judge(with_detections(packets, thinned))
     page = regression_html(home, outcome, "0" * 32)
     assert page == regression_html(home, outcome, "0" * 32)
-    with pytest.MonkeyPatch.context() as patched:
+    with MonkeyPatch.context() as patched:
         place = "ground_service.regression.documents.cell_places_deg"
         patched.setattr(place, lambda cell: np.subtract(cell_places_deg(cell), [[0.0], [360.0]]))
         report = regression_report(home, outcome, "0" * 32)
@@ -496,7 +495,7 @@ def test_the_settings_say_how_long_archives_are_kept(tmp_path, monkeypatch):
         "audit_heads": None,
         "placebo_passes": 3,
     }
-    with pytest.MonkeyPatch.context() as patched:
+    with MonkeyPatch.context() as patched:
         called = MagicMock(return_value=[])
         patched.setattr("ground_service.worker.upkeep.let_go", called)
         assert remove_archives(MagicMock(), kept["archive_days"], kept["archive_limit_mib"]) == 0
@@ -508,7 +507,7 @@ def test_a_registered_build_is_found_by_the_beginning_of_its_identity(ground, ma
     build = register_build(ground, load_build(make_build("kept", packets)))
     assert registered_build(ground, build.digest[:12]).digest == build.digest
     (build.folder / "fly.py").write_text("changed behind its back")
-    with pytest.raises(InvalidInput, match="it was registered with"):
+    with raises(InvalidInput, match="it was registered with"):
         registered_build(ground, build.digest)
 
 
@@ -531,7 +530,7 @@ fail = {level=1.5, reason='y'} -> fail.level: expected less than or equal to 0.2
 """
 
 
-@pytest.mark.parametrize("row", WRONG_POLICIES.strip("\n").split("\n"))
+@mark.parametrize("row", WRONG_POLICIES.strip("\n").split("\n"))
 def test_a_bad_policy_is_refused_with_its_key(row, tmp_path):
     text, message = row.split(" -> ")
     good = "{metric='detector.recall', weight=1, margin=0.1, reason='small'}"
@@ -541,7 +540,7 @@ def test_a_bad_policy_is_refused_with_its_key(row, tmp_path):
     whole.pop(text.partition(" ")[0] or "schema_version", None)
     lines = [text, *(f"{key} = {value}" for key, value in whole.items())]
     (tmp_path / "policy.toml").write_text("\n".join(lines))
-    with pytest.raises(InvalidInput) as error:
+    with raises(InvalidInput) as error:
         load_policy(tmp_path / "policy.toml")
     assert message in str(error.value)
 

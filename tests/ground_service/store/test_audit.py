@@ -6,7 +6,7 @@ import os
 import subprocess
 import sys
 
-import pytest
+from pytest import mark, raises
 from sqlalchemy import text
 from sqlalchemy.exc import DBAPIError
 
@@ -58,11 +58,11 @@ def test_an_entry_is_bound_to_the_one_before_by_a_hash_that_anybody_can_compute(
 
 
 def test_what_is_undone_leaves_no_entry(database):
-    with pytest.raises(RuntimeError), database.writing() as connection:
+    with raises(RuntimeError), database.writing() as connection:
         audit.add_note(connection, audit.Note(5, "ann", "look", "", {}))
         raise RuntimeError
     assert head(database) == audit.Head(0, audit.GENESIS)
-    with database.reading() as connection, pytest.raises(RuntimeError, match="inside Database"):
+    with database.reading() as connection, raises(RuntimeError, match="inside Database"):
         audit.add_note(connection, audit.Note(5, "ann", "look", "", {}))
 
 
@@ -71,10 +71,10 @@ def test_numbers_that_are_not_finite_and_keys_that_are_no_text_are_kept_as_text(
     assert broken(database) == []
 
 
-@pytest.mark.parametrize("statement", ["UPDATE audit SET actor = 'bob'", "DELETE FROM audit WHERE id = 1"])
+@mark.parametrize("statement", ["UPDATE audit SET actor = 'bob'", "DELETE FROM audit WHERE id = 1"])
 def test_the_database_refuses_to_change_the_log(database, statement):
     add(database, "first")
-    with pytest.raises(GroundError, match="audit entries cannot be changed or removed"), database.writing() as one:
+    with raises(GroundError, match="audit entries cannot be changed or removed"), database.writing() as one:
         one.execute(text(statement))
     assert broken(database) == []
     with database.reading() as connection:
@@ -99,7 +99,7 @@ DELETE FROM audit_head | the head of the chain is missing
 """
 
 
-@pytest.mark.parametrize("statement, reason", cells(DAMAGE))
+@mark.parametrize("statement, reason", cells(DAMAGE))
 def test_every_change_of_the_log_is_found(tmp_path, statement, reason):
     database = prepare_database(f"sqlite:///{tmp_path / 'linna.db'}")
     add(database, "first", "second", "third")
@@ -125,7 +125,7 @@ def test_entries_that_are_put_in_are_found(database):
 def test_without_its_head_the_log_takes_no_entry_and_nothing_is_stored(database):
     add(database, "first")
     without_guards(database, "DELETE FROM audit_head")
-    with pytest.raises(AuditBroken), database.writing() as connection:
+    with raises(AuditBroken), database.writing() as connection:
         connection.execute(text("INSERT INTO vehicles (ccsds_id, instance) VALUES (1, 'x')"))
         audit.add_note(connection, audit.Note(5, "ann", "look", "", {}))
     with database.reading() as connection:
@@ -133,7 +133,7 @@ def test_without_its_head_the_log_takes_no_entry_and_nothing_is_stored(database)
 
 
 def test_a_failed_statement_of_the_database_is_reported_as_one(database):
-    with pytest.raises(GroundError) as caught, database.writing() as connection:
+    with raises(GroundError) as caught, database.writing() as connection:
         connection.execute(text("INSERT INTO nothing VALUES (1)"))
     assert isinstance(caught.value.__cause__, DBAPIError)
 

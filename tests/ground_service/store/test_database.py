@@ -8,9 +8,9 @@ import subprocess
 import sys
 import threading
 
-import pytest
 from alembic.autogenerate import compare_metadata
 from alembic.migration import MigrationContext
+from pytest import fixture, mark, raises
 from sqlalchemy import MetaData, delete, insert, inspect, select, text
 
 from ground_service.access.service import add_user, list_users
@@ -65,7 +65,7 @@ def test_a_new_database_is_made_with_the_newest_schema(tmp_path):
     database.engine.dispose()
 
 
-@pytest.mark.parametrize("kind", ["sqlite", "postgresql"])
+@mark.parametrize("kind", ["sqlite", "postgresql"])
 def test_a_migrated_database_has_the_schema_of_the_models(tmp_path, new_postgres_database, kind):
     """A change of the tables without a migration fails here."""
     urls = [url(tmp_path / "a"), url(tmp_path / "b")]
@@ -95,18 +95,18 @@ def test_a_database_of_a_newer_version_is_left_alone(tmp_path):
     with database.writing() as connection:
         connection.execute(text("UPDATE alembic_version SET version_num = '9999'"))
     database.engine.dispose()
-    with pytest.raises(DatabaseTooNew, match=r"linna\.db: expected schema revision \S+, found 9999 of a newer"):
+    with raises(DatabaseTooNew, match=r"linna\.db: expected schema revision \S+, found 9999 of a newer"):
         prepare_database(url(tmp_path))
 
 
-@pytest.mark.parametrize("revision", ["0001", "0011"])
+@mark.parametrize("revision", ["0001", "0011"])
 def test_a_database_before_version_1_is_refused_with_the_way_to_carry_it_over(tmp_path, revision):
     database = prepare_database(url(tmp_path))
     with database.writing() as connection:
         connection.execute(text("UPDATE alembic_version SET version_num = :found"), {"found": revision})
     database.engine.dispose()
     for upgrade in (None, True, False):
-        with pytest.raises(DatabaseTooOld) as caught:
+        with raises(DatabaseTooOld) as caught:
             prepare_database(url(tmp_path), upgrade=upgrade)
     assert f"found {revision} of a version before 1.0" in str(caught.value)
     assert "into a new database with 'linna ingest'" in str(caught.value)
@@ -114,19 +114,19 @@ def test_a_database_before_version_1_is_refused_with_the_way_to_carry_it_over(tm
 
 
 def test_an_empty_database_is_left_empty_where_it_may_not_be_upgraded(tmp_path):
-    with pytest.raises(DatabaseNotMigrated, match="found none; run 'linna db upgrade'"):
+    with raises(DatabaseNotMigrated, match="found none; run 'linna db upgrade'"):
         prepare_database(url(tmp_path), upgrade=False)
 
 
 def test_a_file_that_is_no_database_is_refused_in_one_line(tmp_path):
     (tmp_path / "linna.db").write_bytes(b"not a database, but long enough to be looked at " * 40)
-    with pytest.raises(DatabaseUnavailable, match="file is not a database; expected a SQLite database"):
+    with raises(DatabaseUnavailable, match="file is not a database; expected a SQLite database"):
         prepare_database(url(tmp_path))
 
 
-@pytest.mark.parametrize("wrong", ["nonsense", "oracle+what://x", "postgresql+psycopg://nobody:secret@127.0.0.1:1/x"])
+@mark.parametrize("wrong", ["nonsense", "oracle+what://x", "postgresql+psycopg://nobody:secret@127.0.0.1:1/x"])
 def test_a_database_that_cannot_be_reached_is_named_without_its_password(wrong):
-    with pytest.raises(DatabaseUnavailable) as caught:
+    with raises(DatabaseUnavailable) as caught:
         prepare_database(wrong)
     assert "secret" not in str(caught.value)
     assert "\n" not in str(caught.value)
@@ -136,7 +136,7 @@ def test_a_connection_for_reading_refuses_changes(postgres_url):
     database = prepare_database(postgres_url, upgrade=True)
     changes = (insert(VEHICLES).values(ccsds_id=76, instance="flight"), delete(VEHICLES))
     for change in changes:
-        with pytest.raises(RuntimeError, match="a connection for reading"), database.reading() as connection:
+        with raises(RuntimeError, match="a connection for reading"), database.reading() as connection:
             connection.execute(change)
     with database.writing() as connection:
         connection.execute(changes[0])
@@ -147,7 +147,7 @@ def test_a_connection_for_reading_refuses_changes(postgres_url):
 
 def test_a_write_that_fails_leaves_nothing_behind(tmp_path):
     database = prepare_database(url(tmp_path))
-    with pytest.raises(RuntimeError), database.writing() as connection:
+    with raises(RuntimeError), database.writing() as connection:
         connection.execute(text("INSERT INTO vehicles (ccsds_id, instance) VALUES (1, 'x')"))
         raise RuntimeError
     with database.reading() as connection:
@@ -158,7 +158,7 @@ def test_a_write_that_fails_leaves_nothing_behind(tmp_path):
 def test_a_full_database_is_one_clear_line(tmp_path):
     """SQLite itself says that it is full when it may take no more pages."""
     database = prepare_database(url(tmp_path))
-    with pytest.raises(StorageFull, match="no space left"), database.writing() as connection:
+    with raises(StorageFull, match="no space left"), database.writing() as connection:
         pages = connection.execute(text("PRAGMA page_count")).scalar_one()
         connection.execute(text(f"PRAGMA max_page_count = {pages}"))
         for number in range(2000):
@@ -171,12 +171,12 @@ def test_a_full_database_is_one_clear_line(tmp_path):
 def test_a_read_only_database_is_one_clear_line(tmp_path):
     prepare_database(url(tmp_path)).engine.dispose()
     database = open_database(f"sqlite:///file:{tmp_path / 'linna.db'}?mode=ro&uri=true")
-    with pytest.raises(StorageReadOnly), database.writing() as connection:
+    with raises(StorageReadOnly), database.writing() as connection:
         connection.execute(text("INSERT INTO vehicles (ccsds_id, instance) VALUES (1, 'x')"))
     database.engine.dispose()
 
 
-@pytest.mark.parametrize(
+@mark.parametrize(
     "number, kind", [(errno.ENOSPC, StorageFull), (errno.EROFS, StorageReadOnly), (errno.EACCES, StorageReadOnly)]
 )
 def test_errors_of_the_disk_are_named(number, kind):
@@ -201,7 +201,7 @@ def test_a_file_cut_off_while_stored_leaves_nothing(tmp_path):
         yield b"abc"
         raise OSError(errno.ENOSPC, "No space left on device")
 
-    with pytest.raises(StorageFull):
+    with raises(StorageFull):
         archive.put(broken())
     assert not [p for p in archive.root.rglob("*") if p.is_file()]
 
@@ -211,9 +211,9 @@ def test_a_damaged_file_is_noticed(tmp_path):
     stored = archive.put_octets(b"abcdef")
     stored.path.chmod(0o644)
     stored.path.write_bytes(b"abcdeg")
-    with pytest.raises(FileDamaged, match="expected octets with SHA-256"):
+    with raises(FileDamaged, match="expected octets with SHA-256"):
         archive.get(stored.sha256)
-    with pytest.raises(NotFound):
+    with raises(NotFound):
         archive.get("0" * 64)
 
 
@@ -241,11 +241,11 @@ def test_a_database_of_another_encoding_is_refused_in_one_line(new_postgres_data
     with engine.connect() as connection:
         connection.execute(text("CREATE DATABASE octets ENCODING 'SQL_ASCII' LOCALE 'C' TEMPLATE template0"))
     engine.dispose()
-    with pytest.raises(DatabaseUnavailable, match=r"octets: .* encoding UTF8, found SQL_ASCII$"):
+    with raises(DatabaseUnavailable, match=r"octets: .* encoding UTF8, found SQL_ASCII$"):
         prepare_database(url.rpartition("/")[0] + "/octets", upgrade=True)
 
 
-@pytest.mark.parametrize(
+@mark.parametrize(
     "values",
     [
         {"result": {"value": float("nan")}}, {"result": {"value": [1.0, float("inf")]}}, {"attempts": 10**20},
@@ -258,7 +258,7 @@ def test_a_value_that_no_database_can_hold_is_refused(either, values):
         "created_utc_ns": 1, **values,
     }  # fmt: skip
     with (
-        pytest.raises(InvalidInput, match="request: expected text and numbers that the database can hold") as refused,
+        raises(InvalidInput, match="request: expected text and numbers that the database can hold") as refused,
         either.database.writing() as connection,
     ):
         repository.add(connection, repository.JOBS, **row)
@@ -271,13 +271,13 @@ def test_text_with_nul_is_refused_by_postgresql_as_input(migrated_postgres, tmp_
     url = migrated_postgres()
     with (
         open_ground(tmp_path, database_url=url) as ground,
-        pytest.raises(InvalidInput, match="can hold"),
+        raises(InvalidInput, match="can hold"),
         ground.database.reading() as connection,
     ):
         repository.find(connection, repository.JOBS, id="a\x00")
 
 
-@pytest.mark.parametrize("sqlstate", ["40001", "40P01", "55P03"])
+@mark.parametrize("sqlstate", ["40001", "40P01", "55P03"])
 def test_a_transaction_that_the_database_gave_up_may_be_tried_again(sqlstate):
     class Original(Exception):
         pass
@@ -296,7 +296,7 @@ EXPANSION = f"9.1_works_with_{HEAD}"
 ADD = 'op.add_column("users", sa.Column("remark", sa.Text(), nullable=True))'
 
 
-@pytest.fixture
+@fixture
 def migrations(tmp_path, monkeypatch):
     """A function that makes this version one with a further migration."""
     folder = tmp_path / "migrations"
@@ -326,7 +326,7 @@ def changes_of(folder, migrations, *statements):
     return breaking_changes(before, reflected(prepare_database(f"sqlite:///{folder / 'one.db'}")))
 
 
-@pytest.mark.parametrize(
+@mark.parametrize(
     "statement",
     [
         ADD,
@@ -348,7 +348,7 @@ with op.batch_alter_table("users") as b: b.alter_column("role", type_=sa.Integer
 """
 
 
-@pytest.mark.parametrize("statement, fault", cells(BREAKING))
+@mark.parametrize("statement, fault", cells(BREAKING))
 def test_a_change_that_breaks_the_version_before_it_is_named(tmp_path, migrations, statement, fault):
     found = changes_of(tmp_path, migrations, statement)
     assert found[0].startswith(fault)
@@ -376,7 +376,7 @@ def test_a_program_works_with_an_expanded_schema_and_with_no_other_newer_one(tmp
     database = prepare_database(url)
     with database.writing() as connection:
         connection.execute(text("UPDATE alembic_version SET version_num = '9.2_works_with_9.1'"))
-    with pytest.raises(DatabaseTooNew, match=r"found 9\.2_works_with_9\.1 of a newer version"):
+    with raises(DatabaseTooNew, match=r"found 9\.2_works_with_9\.1 of a newer version"):
         prepare_database(url)
 
 
@@ -398,7 +398,7 @@ def of_version_1(database):
             connection.exec_driver_sql(statement)
 
 
-@pytest.mark.parametrize("kind", ["sqlite", "postgresql"])
+@mark.parametrize("kind", ["sqlite", "postgresql"])
 def test_a_database_of_version_1_0_is_upgraded(tmp_path, new_postgres_database, kind):
     url = f"sqlite:///{tmp_path / 'linna.db'}" if kind == "sqlite" else new_postgres_database()
     old, made = open_database(url), open_database(f"sqlite:///{tmp_path / 'made.db'}")
@@ -420,7 +420,7 @@ def test_a_database_of_version_1_0_is_upgraded(tmp_path, new_postgres_database, 
     made.engine.dispose()
 
 
-@pytest.mark.parametrize("kind", ["sqlite", "postgresql"])
+@mark.parametrize("kind", ["sqlite", "postgresql"])
 def test_a_snapshot_of_the_schema_makes_the_tables_of_this_version(tmp_path, new_postgres_database, kind):
     found, made = (
         open_database(f"sqlite:///{tmp_path / name}" if kind == "sqlite" else new_postgres_database())

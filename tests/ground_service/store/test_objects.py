@@ -5,7 +5,7 @@ import os
 import time
 import uuid
 
-import pytest
+from pytest import fixture, raises
 
 from ground_service.errors import FileDamaged, NotFound, ObjectsUnavailable, SettingsError
 from ground_service.settings import Settings, load_settings
@@ -16,13 +16,13 @@ from ground_service.store.objects import objects_of
 from tests.ground_service.object_server import running_objects
 
 
-@pytest.fixture(scope="module")
+@fixture(scope="module")
 def server():
     with running_objects(f"files-{uuid.uuid4().hex[:8]}") as running:
         yield running
 
 
-@pytest.fixture
+@fixture
 def machine(server, tmp_path):
     """A function that returns the file archive of a machine of its own; the tests use different contents."""
     return lambda name: files_of(tmp_path / name, server.store())
@@ -55,9 +55,9 @@ def test_a_file_that_is_not_stored_is_not_found(machine):
     sha256 = hashlib.sha256(b"never").hexdigest()
     one = machine("a")
     assert one.octets(sha256) is None and not one.path(sha256).exists()
-    with pytest.raises(NotFound):
+    with raises(NotFound):
         one.get(sha256)
-    with pytest.raises(NotFound):
+    with raises(NotFound):
         next(one.blocks(sha256))
 
 
@@ -75,7 +75,7 @@ def test_a_damaged_object_is_not_taken_into_a_cache(machine, server):
     store = server.store().under("files")
     store._client().put_object(Bucket=store.bucket, Key=store.key(stored.sha256), Body=b"bad octets!")
     other = machine("b")
-    with pytest.raises(FileDamaged, match=f"object {stored.sha256}"):
+    with raises(FileDamaged, match=f"object {stored.sha256}"):
         other.path(stored.sha256)
     assert [path for path in other.root.rglob("*") if path.is_file()] == []
     one.remove(stored.sha256)
@@ -92,7 +92,7 @@ def test_nothing_is_acknowledged_while_the_store_is_away(tmp_path):
             lambda: one.octets(known.sha256),
             one.require_writable,
         ):
-            with pytest.raises(ObjectsUnavailable, match="cannot be used"):
+            with raises(ObjectsUnavailable, match="cannot be used"):
                 attempt()
         assert not one.place(hashlib.sha256(b"during").hexdigest()).exists()
         assert one.get(known.sha256) == b"before"  # from the cache
@@ -106,7 +106,7 @@ def test_nothing_is_acknowledged_while_the_store_is_away(tmp_path):
 def test_a_bucket_that_does_not_exist_is_one_line(server, tmp_path):
     settings = Settings(**{**server.settings(), "objects": "s3://another-bucket"})
     files = files_of(tmp_path, objects_of(settings))
-    with pytest.raises(ObjectsUnavailable, match="bucket another-bucket: cannot be used: NoSuchBucket"):
+    with raises(ObjectsUnavailable, match="bucket another-bucket: cannot be used: NoSuchBucket"):
         files.put_octets(b"x")
 
 
@@ -178,5 +178,5 @@ def test_keys_come_from_files_and_are_not_shown(monkeypatch, tmp_path):
     assert found is not None and (found.access_key, found.secret_key) == ("access-value", "secret-value")
     assert found.prefix == "" and "secret-value" not in repr(found)
     monkeypatch.delenv("LINNA_OBJECTS_SECRET_KEY_FILE")
-    with pytest.raises(SettingsError, match="LINNA_OBJECTS_ACCESS_KEY: expected an access key and a secret key"):
+    with raises(SettingsError, match="LINNA_OBJECTS_ACCESS_KEY: expected an access key and a secret key"):
         objects_of(load_settings())

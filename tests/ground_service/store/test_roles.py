@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-import pytest
+from pytest import MonkeyPatch, fixture, mark, raises
 from sqlalchemy import create_engine, make_url, text
 from sqlalchemy.exc import DBAPIError, ProgrammingError
 
@@ -33,7 +33,7 @@ class Roles:
     backup: str
 
 
-@pytest.fixture(scope="module")
+@fixture(scope="module")
 def roles(new_postgres_database):
     superuser = new_postgres_database()
     database = make_url(superuser).database
@@ -47,7 +47,7 @@ def roles(new_postgres_database):
         make_url(superuser).set(username=name).render_as_string(hide_password=False)
         for name in (OWNER, SERVICE, BACKUP)
     ]
-    with pytest.MonkeyPatch.context() as patch:
+    with MonkeyPatch.context() as patch:
         patch.setenv("LINNA_DATABASE_URL", urls[1])
         patch.setenv("LINNA_MIGRATION_DATABASE_URL", urls[0])
         patch.setenv("LINNA_BACKUP_ROLE", BACKUP)
@@ -65,7 +65,7 @@ def roles(new_postgres_database):
 def assert_refused(url, statement):
     engine = create_engine(url, isolation_level="AUTOCOMMIT")
     try:
-        with pytest.raises(DBAPIError) as error, engine.connect() as connection:
+        with raises(DBAPIError) as error, engine.connect() as connection:
             connection.execute(text(statement))
     finally:
         engine.dispose()
@@ -98,7 +98,7 @@ CREATE EXTENSION file_fdw
 """
 
 
-@pytest.mark.parametrize("statement", REFUSED.strip().splitlines())
+@mark.parametrize("statement", REFUSED.strip().splitlines())
 def test_the_role_of_the_service_is_refused(roles, statement):
     assert_refused(roles.service, statement)
 
@@ -116,7 +116,7 @@ COPY (SELECT 1) TO PROGRAM 'true'
 """
 
 
-@pytest.mark.parametrize("statement", REFUSED_BACKUP.strip().splitlines())
+@mark.parametrize("statement", REFUSED_BACKUP.strip().splitlines())
 def test_the_role_of_the_backup_cannot_write(roles, statement):
     assert_refused(roles.backup, statement)
 
@@ -135,7 +135,7 @@ def test_a_backup_is_made_with_the_role_of_the_backup_and_restored(roles, tmp_pa
     assert "bea" in capsys.readouterr().out
 
 
-@pytest.fixture
+@fixture
 def empty(roles, new_postgres_database):
     """Another database of the server, without tables."""
     superuser = new_postgres_database()
@@ -209,7 +209,7 @@ def test_a_role_with_more_power_than_the_service_needs_is_refused(roles, tmp_pat
         (roles.superuser, {"is a superuser", "can create roles", "owns tables", "can change the audit log"}),
         (roles.owner, {"owns tables", "can add to the schema", "can change the audit log"}),
     ):
-        with pytest.raises(PowerfulRole, match="LINNA_MIGRATION_DATABASE_URL") as error:
+        with raises(PowerfulRole, match="LINNA_MIGRATION_DATABASE_URL") as error:
             ground_from_settings(load_settings(home=tmp_path, database_url=url))
         assert powers <= set(error.value.powers)
         assert "is a superuser" in error.value.powers or url == roles.owner
@@ -224,11 +224,11 @@ def test_one_right_too_many_is_noticed(roles):
     with owner.connect() as connection:
         for right in ("UPDATE", "DELETE", "TRUNCATE", "TRIGGER"):
             connection.execute(text(f"GRANT {right} ON audit TO {SERVICE}"))
-            with pytest.raises(PowerfulRole, match="can change the audit log"):
+            with raises(PowerfulRole, match="can change the audit log"):
                 check_role(database)
             connection.execute(text(f"REVOKE {right} ON audit FROM {SERVICE}"))
         connection.execute(text(f"GRANT CREATE ON SCHEMA public TO {SERVICE}"))
-        with pytest.raises(PowerfulRole, match="can add to the schema"):
+        with raises(PowerfulRole, match="can add to the schema"):
             check_role(database)
     owner.dispose()
     database.engine.dispose()
@@ -259,7 +259,7 @@ def test_the_service_cannot_take_the_schema_away(roles, monkeypatch):
     monkeypatch.setenv("LINNA_DATABASE_URL", roles.service)
     monkeypatch.delenv("LINNA_MIGRATION_DATABASE_URL", raising=False)
     database = open_database(roles.service)
-    with pytest.raises(ProgrammingError, match="must be owner"):
+    with raises(ProgrammingError, match="must be owner"):
         METADATA.drop_all(database.engine)
     with database.reading() as connection:
         assert connection.execute(text("SELECT count(*) FROM alembic_version")).scalar() == 1

@@ -5,7 +5,7 @@ import threading
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
-import pytest
+from pytest import raises
 
 import ground_service
 from ground_service.errors import NotFound, StateConflict
@@ -34,7 +34,7 @@ def test_a_transition_happens_once_and_the_second_is_refused_with_the_state_that
     key = add_command(either)
     either.write(move, TELECOMMAND, key, "released", reason="first")
     with (
-        pytest.raises(StateConflict, match=f"telecommand {key}: expected state queued, found released") as lost,
+        raises(StateConflict, match=f"telecommand {key}: expected state queued, found released") as lost,
         either.database.writing() as connection,
     ):
         move(connection, TELECOMMAND, key, "released", reason="second")
@@ -44,7 +44,7 @@ def test_a_transition_happens_once_and_the_second_is_refused_with_the_state_that
 
 
 def test_a_row_that_does_not_exist_is_not_found(either):
-    with pytest.raises(NotFound, match="telecommand 99"), either.database.writing() as connection:
+    with raises(NotFound, match="telecommand 99"), either.database.writing() as connection:
         move(connection, TELECOMMAND, 99, "released")
 
 
@@ -53,7 +53,7 @@ def test_a_transition_can_ask_for_more_than_the_state(either):
         repository.add, repository.JOBS, id="j", kind="report", state="running", arguments={}, progress=0.0,
         attempts=2, created_utc_ns=1,
     )  # fmt: skip
-    with pytest.raises(StateConflict), either.database.writing() as connection:
+    with raises(StateConflict), either.database.writing() as connection:
         move(connection, JOB, "j", "done", where={"attempts": 1})
     either.write(move, JOB, "j", "done", where={"attempts": 2})
 
@@ -97,7 +97,7 @@ def test_counters_give_every_number_once_to_transactions_at_the_same_time(either
 
 def test_a_number_that_was_not_used_is_given_again(either):
     vehicle = either.write(vehicle_id, 1, "flight")
-    with pytest.raises(RuntimeError), either.database.writing() as connection:
+    with raises(RuntimeError), either.database.writing() as connection:
         next_telecommand(connection, vehicle)
         raise RuntimeError("the transaction fails")
     with either.database.writing() as connection:

@@ -17,8 +17,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-import pytest
 from PIL import Image
+from pytest import fixture, skip
 
 from ground_service.ground import open_ground
 from ground_service.passes.archive_import import import_archive
@@ -142,7 +142,7 @@ def live_frame(number):
     }
 
 
-@pytest.fixture
+@fixture
 def live_frames():
     """Five frames of a live payload."""
     return [live_frame(number) for number in range(5)]
@@ -187,7 +187,7 @@ class Service:
         self._log.close()
 
 
-@pytest.fixture(scope="session")
+@fixture(scope="session")
 def console():
     """A payload's console."""
     opened = Console()
@@ -195,7 +195,7 @@ def console():
     opened.close()
 
 
-@pytest.fixture(scope="session")
+@fixture(scope="session")
 def service(tmp_path_factory, synthetic_pass, console):
     """A service without users, with the synthetic pass imported."""
     home = tmp_path_factory.mktemp("web") / "home"
@@ -205,13 +205,13 @@ def service(tmp_path_factory, synthetic_pass, console):
         yield running
 
 
-@pytest.fixture(scope="session")
+@fixture(scope="session")
 def serve():
     """Start another service: ``with serve(home, console_port, openmct, settings)``."""
     return Service
 
 
-@pytest.fixture(scope="session")
+@fixture(scope="session")
 def openmct(tmp_path_factory):
     """The npm package: that of `make openmct`, else installed from the lock file for these tests."""
     if pages.FOLDER.is_dir():
@@ -225,7 +225,7 @@ def openmct(tmp_path_factory):
     except (OSError, subprocess.SubprocessError) as error:
         if os.environ.get("CI"):
             raise
-        pytest.skip(f"Open MCT cannot be installed: {error}")
+        skip(f"Open MCT cannot be installed: {error}")
     return folder / "node_modules" / "openmct"
 
 
@@ -243,7 +243,7 @@ class Pictures:
         picture.quantize(256).save(self.folder / f"{name}.png", optimize=True)
 
 
-@pytest.fixture(scope="module")
+@fixture(scope="module")
 def browser():
     """The system's Chromium, without a screen; a state that is reached ends the wait for it.
 
@@ -284,7 +284,7 @@ def strict_page(browser, url, *, strict=True):
     assert errors == []
 
 
-@pytest.fixture
+@fixture
 def page(browser, service):
     """A fresh page of the service."""
     with strict_page(browser, service.url, strict=False) as opened:
@@ -296,7 +296,7 @@ def _note_foreign(url, own, errors):
         errors.append(f"asked another host: {url}")
 
 
-@pytest.fixture
+@fixture
 def day_of_orbits(tmp_path):
     """Six hours of a circular orbit as an OEM file."""
     start = parse_utc("2030-01-01T00:00:00Z")

@@ -10,8 +10,8 @@ import urllib.error
 import urllib.request
 
 import numpy as np
-import pytest
 from PIL import Image
+from pytest import fixture, mark
 
 from ground_service.ground import open_ground
 from ground_service.passes.archive_import import import_archive
@@ -38,7 +38,7 @@ def ask(url, body=None, **headers):
             return error.code, error.read(), error.headers
 
 
-@pytest.fixture(scope="module")
+@fixture(scope="module")
 def shown(tmp_path_factory, synthetic_pass, serve, openmct):
     """A service with the pages, the synthetic pass imported."""
     home = tmp_path_factory.mktemp("displays") / "home"
@@ -48,7 +48,7 @@ def shown(tmp_path_factory, synthetic_pass, serve, openmct):
         yield running
 
 
-@pytest.fixture
+@fixture
 def mct(browser, shown):
     """A page for the displays; the test fails on an error in the console or a violation of the policy."""
     with strict_page(browser, shown.url) as opened:
@@ -235,7 +235,7 @@ FOLLOW = """async (key) => {
 }"""
 
 
-@pytest.mark.parametrize("kind, second", [("events", 10), ("parameter", 20)])
+@mark.parametrize("kind, second", [("events", 10), ("parameter", 20)])
 def test_what_comes_within_a_minute_of_the_newest_telemetry_is_shown_once(mct, shown, kind, second):
     instance = spacecraft(shown.url)["instance"]
     receive(shown.url, 20.0, second - 1)

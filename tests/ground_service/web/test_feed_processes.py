@@ -5,7 +5,7 @@ import threading
 from concurrent.futures import ThreadPoolExecutor
 from unittest.mock import MagicMock
 
-import pytest
+from pytest import fixture
 
 from benchmarks._servers import Deployment
 from ground_service.app import create_app
@@ -22,7 +22,7 @@ NEVER_S = 3600.0
 LIVE = "/api/v1/live?values=true"
 
 
-@pytest.fixture
+@fixture
 def server_url(migrated_postgres):
     """An empty PostgreSQL database with the schema."""
     return migrated_postgres()
@@ -57,7 +57,7 @@ def temperature_after(socket):
     return float(value)
 
 
-@pytest.fixture
+@fixture
 def other(tmp_path, server_url, monkeypatch):
     """An API process A with links, and the client of an API B in this process, which never polls."""
     monkeypatch.setattr(sockets, "POLL_S", NEVER_S)

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-import pytest
+from pytest import fixture, mark
 
 from ground_service.ground import open_ground
 from ground_service.missions.ephemerides.service import add_ephemeris
@@ -115,7 +115,7 @@ class Flown:
         return {one["name"]: one["value"] for one in items if one["packet"] == "housekeeping"}
 
 
-@pytest.fixture(scope="module")
+@fixture(scope="module")
 def flown(tmp_path_factory, serve, openmct, browser):
     """A payload flown live with its operator and `ORDERS`, started on the live page, followed in a layout."""
     folder = tmp_path_factory.mktemp("flight")
@@ -200,7 +200,7 @@ IMAGES_LOADED = """() => {
 }"""
 
 
-@pytest.fixture
+@fixture
 def opened(flown, browser):
     """A page of its own for the displays."""
     with strict_page(browser, flown.url) as page:
@@ -303,7 +303,7 @@ def test_the_live_page_shows_what_the_payload_matched(flown, tmp_path):
     Pictures(tmp_path).take(flown.live, "live")
 
 
-@pytest.mark.parametrize("kind, width_px", [("images", 128), ("detections", 512)])
+@mark.parametrize("kind, width_px", [("images", 128), ("detections", 512)])
 def test_downlinked_images_are_shown(flown, opened, tmp_path, kind, width_px):
     opened.goto(address(kind))
     # The camera gave no image of one of every second frame.

@@ -1,7 +1,7 @@
 """Landmarks learned from flight, reviewed in Chromium."""
 
 import numpy as np
-import pytest
+from pytest import fixture
 
 from ground_service.access.service import add_user
 from ground_service.evaluation.landmarks.model import LandmarkFilter
@@ -19,7 +19,7 @@ from tests.lazy import expect
 FRAMES = 12
 
 
-@pytest.fixture(scope="module")
+@fixture(scope="module")
 def searched(tmp_path_factory, make_flyable, console, serve):
     """A service whose catalogue lacks every third crater of two passes, with their images; tokens of two users."""
     home = tmp_path_factory.mktemp("searched") / "home"
@@ -36,7 +36,7 @@ def searched(tmp_path_factory, make_flyable, console, serve):
         yield running.url, tokens
 
 
-@pytest.fixture
+@fixture
 def review(browser, searched):
     """Open the page as a user of a role; the test fails if a script of a page fails."""
     contexts, errors = [], []

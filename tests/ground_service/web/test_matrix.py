@@ -9,7 +9,7 @@ import subprocess
 from pathlib import Path
 
 import numpy as np
-import pytest
+from pytest import fixture, mark, param
 
 from ground_service.access.service import add_user
 from ground_service.client import Client
@@ -41,9 +41,7 @@ FEW_LOOKS = (
 )  # fmt: skip
 """Each scheme, font and width at least once; the last width is that of the keyboard."""
 
-LOOKS = pytest.mark.parametrize(
-    "looks", [FEW_LOOKS, pytest.param(EVERY_LOOK, marks=pytest.mark.campaign)], ids=["few", "every"]
-)
+LOOKS = mark.parametrize("looks", [FEW_LOOKS, param(EVERY_LOOK, marks=mark.campaign)], ids=["few", "every"])
 AXE_WIDTHS = (1280, 768, 390)
 LONG_LOG = """() => {
   const feed = document.getElementById("feed");
@@ -94,7 +92,7 @@ FRAMES_DRAWN = "() => new Promise((drawn) => requestAnimationFrame(() => request
 WIDTH = "document.documentElement.scrollWidth"
 
 
-@pytest.fixture(scope="module")
+@fixture(scope="module")
 def empty_service(tmp_path_factory, console, serve):
     """A service without any data."""
     home = tmp_path_factory.mktemp("empty") / "home"
@@ -112,7 +110,7 @@ class Worked:
         self.paths = paths
 
 
-@pytest.fixture(scope="module")
+@fixture(scope="module")
 def worked(tmp_path_factory, make_pass, make_flyable, make_build, console, serve):
     """A service with a pass received over TCP, a report, landmarks, a window, telecommands, an alarm and a build."""
     folder = tmp_path_factory.mktemp("worked")
@@ -227,7 +225,7 @@ def barriers(page):
     ]
 
 
-@pytest.fixture(scope="module")
+@fixture(scope="module")
 def rows():
     """Rows of the table, written at the end where a file is named."""
     lines = []
@@ -264,7 +262,7 @@ def new_page(context):
     return page
 
 
-@pytest.fixture(scope="module")
+@fixture(scope="module")
 def administrator(browser, worked):
     """The browser of somebody who is signed in."""
     context = patient(browser.new_context(base_url=worked.url, viewport={"width": 1280, "height": 844}))
@@ -278,7 +276,7 @@ def administrator(browser, worked):
     context.close()
 
 
-@pytest.fixture(scope="module")
+@fixture(scope="module")
 def newcomer(browser, empty_service):
     """The browser of somebody at a service without data."""
     context = patient(browser.new_context(base_url=empty_service.url, viewport={"width": 1280, "height": 844}))
@@ -292,7 +290,7 @@ def test_the_fonts_of_the_matrix_are_installed():
 
 
 @LOOKS
-@pytest.mark.parametrize("path", PATHS)
+@mark.parametrize("path", PATHS)
 def test_a_page_with_data_has_no_fault(administrator, worked, rows, path, looks):
     look(administrator, rows, path, "with", looks, worked.paths.get(path))
 
@@ -307,7 +305,7 @@ NEEDED = """
 """
 
 
-@pytest.mark.parametrize("path, needed", cells(NEEDED))
+@mark.parametrize("path, needed", cells(NEEDED))
 def test_a_telephone_shows_what_a_shift_needs_without_scrolling_tables(administrator, path, needed):
     page = new_page(administrator)
     page.set_viewport_size({"width": 390, "height": 844})
@@ -319,7 +317,7 @@ def test_a_telephone_shows_what_a_shift_needs_without_scrolling_tables(administr
 
 
 @LOOKS
-@pytest.mark.parametrize("path", [path for path in PATHS if path not in DETAILS])
+@mark.parametrize("path", [path for path in PATHS if path not in DETAILS])
 def test_a_page_without_data_has_no_fault(newcomer, rows, path, looks):
     look(newcomer, rows, path, "without", looks)
 

@@ -3,7 +3,7 @@
 import csv
 import re
 
-import pytest
+from pytest import approx, fixture
 
 from ground_service.access.service import add_user
 from ground_service.ground import open_ground
@@ -62,7 +62,7 @@ def test_zoom_and_charts_are_in_the_address(page):
     page.reload()
     expect(page.get_by_label("chart: temperature and bus voltage")).to_be_visible()
     found = page.evaluate("(({min, max}) => [min, max])(document.querySelector('.chart').plot.scales.x)")
-    assert found == pytest.approx(wanted, abs=1.0)
+    assert found == approx(wanted, abs=1.0)
     page.locator(".chart").first.focus()
     page.keyboard.press("0")
     expect(page).not_to_have_url(re.compile("zoom="))
@@ -153,7 +153,7 @@ def test_passes_without_a_kept_archive_are_listed_with_what_to_do(browser, tmp_p
         expect(row.locator("input")).to_be_disabled()
 
 
-@pytest.fixture(scope="module")
+@fixture(scope="module")
 def guarded(tmp_path_factory, console, serve, synthetic_pass):
     """A service with a viewer and an operator, one pass and an alarm."""
     home = tmp_path_factory.mktemp("roles") / "home"
@@ -167,7 +167,7 @@ def guarded(tmp_path_factory, console, serve, synthetic_pass):
         yield running.url, tokens
 
 
-@pytest.fixture
+@fixture
 def signed_in(browser, guarded):
     """A page of a signed-in user: ``signed_in(role)``."""
     contexts = []
@@ -291,7 +291,7 @@ def test_a_live_view_takes_matches_from_the_payload(page, console, live_frames):
     assert unmatched[2] > 150, unmatched  # blue
 
 
-@pytest.fixture
+@fixture
 def planner(browser, tmp_path, console, serve, day_of_orbits):
     """The planner of a spacecraft with an ephemeris of six hours, a small battery and two drafts."""
     home = tmp_path / "home"
@@ -323,7 +323,7 @@ def test_the_planner_shows_sun_and_resources_of_the_plan(planner):
     day = sum(one >= 0 for one in found["sun_elevation_deg"]) / len(found["time_s"])
     label = page.locator("#timeline .sun").get_attribute("aria-label")
     night = re.search(r"night (\d+) %", label)
-    assert int(night[1] if night else 0) == pytest.approx(100 * (1 - day), abs=0.51), label
+    assert int(night[1] if night else 0) == approx(100 * (1 - day), abs=0.51), label
     battery = page.locator("#timeline .curve.battery").get_attribute("aria-label")
     least, most = (100 * limit(found["battery_share"]) for limit in (min, max))
     assert battery == f"battery: {least:.3g} to {most:.3g} %, at least 30"
@@ -345,7 +345,7 @@ def test_a_draft_is_moved_and_resized_by_keys_by_the_form_and_with_the_pointer(p
     for key, expected in (("ArrowDown", (61.0, 80.0)), ("]", (62.0, 80.0)), ("Shift+ArrowUp", (62.0, 80.0 + 1 / 6))):
         answered(page)
         bar.press(key)
-        wait_for(lambda expected=expected: times(page, 1) == pytest.approx(expected), key)
+        wait_for(lambda expected=expected: times(page, 1) == approx(expected), key)
     answered(page)
     page.locator("#selected").get_by_label("Stop, UTC").fill("2030-01-01T01:15:00Z")
     page.locator("#selected").get_by_role("button", name="Change").click()
@@ -360,11 +360,11 @@ def test_a_draft_is_moved_and_resized_by_keys_by_the_form_and_with_the_pointer(p
     page.mouse.down()
     page.mouse.move(box["x"] + 3 - box["width"] / 2, box["y"] + 5, steps=4)
     shown = bar.locator("rect").bounding_box()
-    assert shown["width"] == pytest.approx(1.5 * box["width"], rel=0.02)
+    assert shown["width"] == approx(1.5 * box["width"], rel=0.02)
     page.mouse.up()
     wait_for(lambda: times(page, 1)[0] < 60.0, "not resized with the pointer")
     start, stop = times(page, 1)
-    assert stop == 75.0 and start == pytest.approx(62.0 - 13.0 / 2, abs=0.3)
+    assert stop == 75.0 and start == approx(62.0 - 13.0 / 2, abs=0.3)
 
 
 def test_times_being_typed_survive_an_update_of_the_planner(planner):

@@ -3,7 +3,7 @@
 import re
 
 import numpy as np
-import pytest
+from pytest import mark, raises
 
 from ground_service.errors import InvalidInput
 from ground_service.evaluation.extras import WIDTH_PX
@@ -17,7 +17,7 @@ cv2 = Lazy("cv2")
 PATHS = [page.path.replace("{pass_id}", "1").replace("{revision}", "0" * 16) for page in PAGES]
 
 
-@pytest.mark.parametrize("path", PATHS)
+@mark.parametrize("path", PATHS)
 def test_a_page_runs_only_scripts_of_this_service(service, path):
     status, body, headers = ask(service.url + path)
     assert status == 200
@@ -36,7 +36,7 @@ ENTRIES = """
 """
 
 
-@pytest.mark.parametrize("path, entry", cells(ENTRIES))
+@mark.parametrize("path, entry", cells(ENTRIES))
 def test_the_navigation_marks_the_page_that_a_detail_belongs_to(service, path, entry):
     _, body, _ = ask(service.url + path)
     assert re.findall(rb'aria-current="page">([^<]+)<', body) == [entry.encode()]
@@ -49,7 +49,7 @@ def test_files_with_a_version_are_kept_and_without_one_are_asked_for_again(servi
     assert ask(service.url + "/static/site.css")[2]["Cache-Control"] == "no-cache"
 
 
-@pytest.mark.parametrize(
+@mark.parametrize(
     "path", ["/static/../pages.py", "/static/%2e%2e/pages.py", "/static/nothing.js", "/static/", "/static//etc/passwd"]
 )
 def test_no_other_file_can_be_reached(service, path):
@@ -76,5 +76,5 @@ def test_the_map_is_stretched_over_the_grey_values_and_half_as_high_as_wide(tmp_
 def test_a_map_that_is_no_picture_is_named(tmp_path):
     path = tmp_path / "albedo.jpg"
     path.write_bytes(b"nothing of the kind")
-    with pytest.raises(InvalidInput, match=r"albedo\.jpg"):
+    with raises(InvalidInput, match=r"albedo\.jpg"):
         basemap_jpeg(path)

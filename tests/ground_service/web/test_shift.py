@@ -9,7 +9,7 @@ from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import dataclass, field
 
 import numpy as np
-import pytest
+from pytest import fixture
 
 from ground_service.access.service import add_user
 from ground_service.ground import open_ground
@@ -150,7 +150,7 @@ class Shift:
     spacecraft: Spacecraft
 
 
-@pytest.fixture
+@fixture
 def shift(tmp_path, make_pass, console, serve):
     """A service with users, a mission, an ephemeris of the coming days, and one pass."""
     spacecraft = Spacecraft()
@@ -198,7 +198,7 @@ def telemetry(spacecraft):
         sending.join()
 
 
-@pytest.fixture
+@fixture
 def operator(browser, shift):
     """The operator's browser."""
     with strict_page(browser, shift.url, strict=False) as page:

@@ -2,7 +2,7 @@
 
 import re
 
-import pytest
+from pytest import fixture, mark
 
 from ground_service.access.service import add_user, list_tokens, list_users
 from ground_service.ground import open_ground
@@ -12,7 +12,7 @@ from tests.lazy import expect
 from tests.serving import token_valid
 
 
-@pytest.fixture(scope="module")
+@fixture(scope="module")
 def guarded(tmp_path_factory, console, serve):
     """A service with one viewer; its address and the viewer's token."""
     home = tmp_path_factory.mktemp("guarded") / "home"
@@ -22,7 +22,7 @@ def guarded(tmp_path_factory, console, serve):
         yield running.url, token
 
 
-@pytest.fixture
+@fixture
 def stranger(browser, guarded):
     """A page of somebody who has not signed in."""
     context = patient(browser.new_context(base_url=guarded[0]))
@@ -73,7 +73,7 @@ def test_a_viewer_may_not_steer_the_payload(stranger, guarded, console):
     assert console.received == []
 
 
-@pytest.mark.parametrize("address", ["/reports/{key}#part", "/?next=/reports/{key}%23part"])
+@mark.parametrize("address", ["/reports/{key}#part", "/?next=/reports/{key}%23part"])
 def test_the_part_of_a_page_in_the_address_is_kept_over_the_sign_in(stranger, guarded, address):
     stranger.goto(address.format(key="0" * 32))
     asks(stranger)
@@ -82,7 +82,7 @@ def test_the_part_of_a_page_in_the_address_is_kept_over_the_sign_in(stranger, gu
     expect(stranger.locator("body")).to_contain_text("not found")
 
 
-@pytest.mark.parametrize("next_page", ["//example.org/", "/%5Cexample.org/", "https://example.org/"])
+@mark.parametrize("next_page", ["//example.org/", "/%5Cexample.org/", "https://example.org/"])
 def test_after_sign_in_no_other_host_is_opened(stranger, guarded, next_page):
     stranger.goto(f"/?next={next_page}")
     sign_in(stranger, guarded[1])
@@ -111,14 +111,14 @@ def test_the_sign_in_is_used_with_the_keyboard(stranger, guarded):
     expect(stranger.locator("#user")).to_have_text("ada, viewer")
 
 
-@pytest.fixture(scope="module")
+@fixture(scope="module")
 def provider():
     with running_provider() as running:
         running.claims["roles"] = ["linna-admins"]
         yield running
 
 
-@pytest.fixture(scope="module")
+@fixture(scope="module")
 def signed_in_elsewhere(tmp_path_factory, serve, console, provider):
     """The address of a service whose users sign in with the provider."""
     home = tmp_path_factory.mktemp("openid") / "home"
@@ -185,7 +185,7 @@ def test_the_api_page_uses_the_session_of_the_signed_in_user(browser, serve, con
         assert answered.value.status == 200
 
 
-@pytest.fixture(scope="module")
+@fixture(scope="module")
 def managed(tmp_path_factory, serve, console):
     """A service with an administrator and a viewer: address, home folder, token of the administrator."""
     home = tmp_path_factory.mktemp("managed") / "home"
@@ -196,7 +196,7 @@ def managed(tmp_path_factory, serve, console):
         yield running.url, home, token
 
 
-@pytest.fixture
+@fixture
 def admin(browser, managed):
     """The page of users, of an administrator who has signed in."""
     context = patient(browser.new_context(base_url=managed[0]))

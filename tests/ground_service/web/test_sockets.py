@@ -3,7 +3,7 @@
 import asyncio
 from concurrent.futures import ThreadPoolExecutor
 
-import pytest
+from pytest import fixture, mark, raises
 from starlette.websockets import WebSocketDisconnect
 
 from ground_service.access import service as users
@@ -20,7 +20,7 @@ LIVE = "/api/v1/live"
 TICKS = 900_000_000 * 65_536
 
 
-@pytest.fixture
+@fixture
 def client(tmp_path, monkeypatch):
     """Service with limits of three sockets per caller and five in total, which verifies callers immediately."""
     monkeypatch.setattr(sockets, "VERIFY_S", 0.05)
@@ -45,7 +45,7 @@ def say(ground, number):
 
 def closing_code(socket):
     """Return the close code of a socket; skip earlier messages."""
-    with pytest.raises(WebSocketDisconnect) as closed:
+    with raises(WebSocketDisconnect) as closed:
         while True:
             socket.receive_text()
     return int(closed.value.code)
@@ -64,8 +64,8 @@ def renew(ground, name):
     users.add_token(ground, name, revoke_others=True)
 
 
-@pytest.mark.parametrize("path", [LIVE, "/api/v1/payload"])
-@pytest.mark.parametrize("end", [disable, revoke, renew])
+@mark.parametrize("path", [LIVE, "/api/v1/payload"])
+@mark.parametrize("end", [disable, revoke, renew])
 def test_a_socket_ends_with_the_right_to_hold_it(client, end, path, monkeypatch):
     async def hold(session):
         await session.accept()
@@ -82,7 +82,7 @@ def test_a_socket_ends_with_the_right_to_hold_it(client, end, path, monkeypatch)
         assert closing_code(socket) == sockets.POLICY_VIOLATION
         say(ground, 7)
         assert kept.receive_json()["payload"] == {"number": 7}
-    with pytest.raises(WebSocketDisconnect), client.websocket_connect(path, headers=bearer(token)):
+    with raises(WebSocketDisconnect), client.websocket_connect(path, headers=bearer(token)):
         pass
 
 
@@ -295,7 +295,7 @@ def test_a_slow_socket_skips_values_and_no_events():
     assert sent == ["event 1", "event 2", "event 3", "values 3", "values of detections"]
 
 
-@pytest.mark.parametrize("query", ["values=maybe", "values=true&values=true", "value=true"])
+@mark.parametrize("query", ["values=maybe", "values=true&values=true", "value=true"])
 def test_an_invalid_query_is_refused(client, query):
-    with pytest.raises((WebSocketDisconnect, WebSocketDenialResponse)):
+    with raises((WebSocketDisconnect, WebSocketDenialResponse)):
         client.websocket_connect(f"{LIVE}?{query}").__enter__()

@@ -7,7 +7,7 @@ from pathlib import Path
 from unittest.mock import Mock
 
 import numpy as np
-import pytest
+from pytest import fixture, mark, raises
 
 from ground_service.client.connection import Conflict as ClientConflict
 from ground_service.client.local import local_client
@@ -75,7 +75,7 @@ recall = 0.5
 """
 
 
-@pytest.fixture(scope="module")
+@fixture(scope="module")
 def flown(make_pass):
     return make_pass(frames=FRAMES, seed=9)
 
@@ -275,7 +275,7 @@ def test_an_unfinished_job_of_a_rule_of_an_earlier_version_ends_without_work(gro
     assert failed.error == "event 99: not found"
 
 
-@pytest.mark.parametrize("evaluate", [False, None])
+@mark.parametrize("evaluate", [False, None])
 def test_an_imported_archive_is_kept_once_unless_the_mission_evaluates_nothing(ground, flown, evaluate):
     stated = "" if evaluate is None else "[automation]\nevaluate = false\n"
     add_mission(ground, f'name = "m"\n[spacecraft]\nid = {SPACECRAFT}\n{stated}'.encode())
@@ -298,16 +298,16 @@ def test_the_catalogue_of_a_live_pass_is_cut_to_its_track(ground, flown):
 
 def test_a_mission_without_an_available_catalogue_is_refused_with_the_reason(ground):
     missing = parse_mission(f'name = "m"\n[catalogue]\nsha256 = "{"0" * 64}"\n')
-    with pytest.raises(InvalidInput, match=r"m, catalogue.sha256: expected a catalogue that the ground holds"):
+    with raises(InvalidInput, match=r"m, catalogue.sha256: expected a catalogue that the ground holds"):
         catalogue_of(ground, missing)
-    with pytest.raises(InvalidInput, match="linna catalogue add FILE"):
+    with raises(InvalidInput, match="linna catalogue add FILE"):
         catalogue_of(ground, parse_mission('name = "m"\n[catalogue]\nsource = "x"\n'))
-    with pytest.raises(InvalidInput, match="found neither"):
+    with raises(InvalidInput, match="found neither"):
         catalogue_of(ground, parse_mission('name = "m"\n'))
 
 
 def test_only_a_crater_catalogue_is_held(ground, flown):
-    with pytest.raises(InvalidInput, match="crater catalogue"):
+    with raises(InvalidInput, match="crater catalogue"):
         add_catalogue(ground, ground.files.put_octets(b"a,b\n1,2\n"), "x.csv")
     for _ in range(2):
         add_catalogue(ground, ground.files.put_file(flown.folder / "catalogue.csv"), "craters.csv")
@@ -340,7 +340,7 @@ def test_a_processed_pass_is_searched_for_landmarks(either, flown, tmp_path):
     assert page.total == added > 20 and {one.state for one in page.items} == {"seen"}
 
 
-@pytest.fixture
+@fixture
 def job_that(monkeypatch, ground):
     """A function that enters a job with the given work."""
 
@@ -358,8 +358,8 @@ def row_of(ground, job):
 MISSING = FileNotFoundError(errno.ENOENT, "No such file or directory", "/srv/linna/files/ab")
 
 
-@pytest.mark.parametrize(
-    ("error", "shown"),
+@mark.parametrize(
+    "error, shown",
     [
         (OverflowError("Python int too large"), "OverflowError: Python int too large"),
         (KeyError("vehicle"), "KeyError: 'vehicle'"), (ValueError("first\nsecond"), "ValueError: first second"),
@@ -402,10 +402,10 @@ def test_a_failed_job_is_repeated_by_one_action(ground, job_that, monkeypatch):
     monkeypatch.setitem(jobs.WORK, "nightly", lambda *_: {"repeated": True})
     with local_client(ground, "ann") as client:
         assert client.repeat_job(job).result == {"repeated": True}
-        with pytest.raises(ClientConflict, match="expected state failed, found done"):
+        with raises(ClientConflict, match="expected state failed, found done"):
             client.repeat_job(job)
         assert next(iter(client.list_audit(action="repeat job"))).actor == "ann"
-        with pytest.raises(ClientConflict, match="expected state failed, found done"):
+        with raises(ClientConflict, match="expected state failed, found done"):
             client.delete_job(job)
 
 
@@ -427,7 +427,7 @@ def test_the_traceback_of_an_unexpected_error_is_in_the_log(ground, job_that, ca
 
 def test_a_full_disk_is_no_fault_of_the_job(ground, job_that):
     job = job_that(Mock(side_effect=OSError(errno.ENOSPC, "No space left on device")))
-    with pytest.raises(StorageFull):
+    with raises(StorageFull):
         run_job(ground, job)
     row = row_of(ground, job)
     assert (row["state"], row["attempts"]) == ("queued", 0)
@@ -453,7 +453,7 @@ def test_an_id_that_stands_for_another_request_is_refused(ground):
     enter_job(ground, "report", {"pass_id": 1}, job_id="a" * 32)
     assert enter_job(ground, "report", {"pass_id": 1}, job_id="a" * 32) == "a" * 32
     for kind, arguments in (("report", {"pass_id": 2}), ("nightly", {})):
-        with pytest.raises(Conflict, match="found another"):
+        with raises(Conflict, match="found another"):
             ground.write(add_job, kind, arguments, job_id="a" * 32)
 
 
@@ -463,13 +463,13 @@ def test_an_ingest_asked_for_twice_is_one_and_of_another_file_is_refused(ground)
     first = enter_ingest(ground, one, "one", **given)
     assert enter_ingest(ground, one, "one", **given) == first
     for stored, changed in ((other, {}), (one, {"spacecraft_id": 77}), (one, {"instance": "else"})):
-        with pytest.raises(Conflict, match="found another"):
+        with raises(Conflict, match="found another"):
             enter_ingest(ground, stored, "one", **(given | changed))
     assert ground.read(repository.newest, repository.INGESTS, Paging())[1] == 1
 
 
-@pytest.mark.parametrize(
-    ("error", "shown"),
+@mark.parametrize(
+    "error, shown",
     [
         (DatabaseUnavailable("postgresql://linna:***@db/linna", "gone"), "database (address) cannot be opened: gone"),
         (FileDamaged(Path("/srv/linna/files/ab/cdef"), "1", "2"), "cdef: expected octets with SHA-256 1, found 2"),

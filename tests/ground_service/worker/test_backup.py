@@ -5,7 +5,7 @@ import json
 import re
 import sqlite3
 
-import pytest
+from pytest import fixture, mark, raises
 from sqlalchemy import select, text
 
 from ground_service.access.service import add_user, authenticate, list_users
@@ -38,7 +38,7 @@ def rows_of_an_empty_service(ground):
     return {name: rows for name, rows in everything(ground).items() if rows} == {"audit_head": [(1, 0, "0" * 64)]}
 
 
-@pytest.fixture
+@fixture
 def filled(ground, synthetic_pass):
     import_archive(ground, synthetic_pass.folder)
     for k in (2, 1):
@@ -48,7 +48,7 @@ def filled(ground, synthetic_pass):
     return ground, add_user(ground, "ann", "operator")
 
 
-@pytest.fixture
+@fixture
 def saved(filled, tmp_path):
     manifest = backup(filled[0], tmp_path / "saved", now_utc_ns=START)
     assert manifest["made_utc"] == "2033-05-18T03:33:20.000Z"
@@ -63,29 +63,29 @@ def test_everything_comes_back(filled, saved, tmp_path):
         assert authenticate(other, token).name == "ann"
         assert pass_summary(other, 1) == pass_summary(ground, 1)
         add_window(other, WindowEntry("new", START, START + NS, 1.0, 76), actor="bob")  # keys go on behind
-        with pytest.raises(Conflict, match="expected an empty service, found"):
+        with raises(Conflict, match="expected an empty service, found"):
             restore(saved, other)
 
 
 def test_a_backup_overwrites_nothing(filled, saved):
     before = (saved / "linna.db").read_bytes()
-    with pytest.raises(Conflict, match="expected a folder that is new or empty"):
+    with raises(Conflict, match="expected a folder that is new or empty"):
         backup(filled[0], saved, now_utc_ns=START)
     assert (saved / "linna.db").read_bytes() == before
 
 
-@pytest.mark.parametrize("file", [0, -1])
+@mark.parametrize("file", [0, -1])
 def test_a_damaged_file_is_found_before_anything_is_restored(saved, tmp_path, file):
     damaged = sorted(path for path in (saved / "files").rglob("*") if path.is_file())[file]
     damaged.chmod(0o644)
     damaged.write_bytes(b"x" + damaged.read_bytes())
     with open_ground(tmp_path / "again") as other:
-        with pytest.raises(FileDamaged):
+        with raises(FileDamaged):
             restore(saved, other)
         assert rows_of_an_empty_service(other)
         assert not [path for path in other.files.root.rglob("*") if path.is_file()]
         damaged.unlink()
-        with pytest.raises(NotFound):
+        with raises(NotFound):
             restore(saved, other)
 
 
@@ -98,14 +98,14 @@ INSERT INTO vehicles (ccsds_id, instance) VALUES (3, 'x') | vehicles: expected
 UPDATE audit_head SET number = 2 | audit_head: expected the rows that were saved"""
 
 
-@pytest.mark.parametrize("row", CHANGES.splitlines())
+@mark.parametrize("row", CHANGES.splitlines())
 def test_a_changed_row_of_a_backup_is_not_restored(saved, tmp_path, row):
     statement, reason = row.split(" | ")
     with sqlite3.connect(saved / "linna.db") as connection:
         connection.execute(statement)
     connection.close()
     with open_ground(tmp_path / "again") as other:
-        with pytest.raises(InvalidInput, match=re.escape(reason)):
+        with raises(InvalidInput, match=re.escape(reason)):
             restore(saved, other)
         assert rows_of_an_empty_service(other)
 
@@ -127,9 +127,9 @@ def test_a_changed_list_of_a_backup_is_not_believed(saved, tmp_path):
         ({"tables": {}}, "expected the rows that were saved"),
     ):
         (saved / "backup.json").write_text(json.dumps({**manifest, **changes}))
-        with open_ground(tmp_path / "again") as other, pytest.raises(InvalidInput, match=reason):
+        with open_ground(tmp_path / "again") as other, raises(InvalidInput, match=reason):
             restore(saved, other)
-    with open_ground(tmp_path / "again") as other, pytest.raises(InvalidInput, match="expected a backup"):
+    with open_ground(tmp_path / "again") as other, raises(InvalidInput, match="expected a backup"):
         restore(tmp_path, other)
 
 

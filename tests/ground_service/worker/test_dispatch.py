@@ -13,7 +13,7 @@ from types import SimpleNamespace
 from unittest.mock import MagicMock, Mock
 
 import numpy as np
-import pytest
+from pytest import approx, fixture, mark, raises
 from sqlalchemy import func, select, text
 
 from ground_service.access import service as users
@@ -57,12 +57,12 @@ from tmtc.dictionary.payload import DICTIONARY
 from tmtc.downlink import encode_cadus
 
 
-@pytest.fixture(scope="module")
+@fixture(scope="module")
 def downlink(make_pass):
     return Path(make_pass(frames=30, seed=4).folder) / "downlink.cadu"
 
 
-@pytest.fixture
+@fixture
 def small_windows(monkeypatch):
     """The stream is stored in about ten transactions."""
     monkeypatch.setattr(files, "BLOCK_OCTETS", 4_000)
@@ -74,7 +74,7 @@ def enter(ground, downlink):
     return enter_ingest(ground, stored, "d", spacecraft_id=76, instance="flight")[1]
 
 
-@pytest.mark.usefixtures("small_windows")
+@mark.usefixtures("small_windows")
 def test_an_ingest_is_broken_off_when_the_service_stops_and_goes_on_at_the_next_start(downlink, tmp_path, monkeypatch):
     with open_ground(tmp_path / "whole") as ground:
         ingest_file(ground, downlink)
@@ -199,7 +199,7 @@ def ingest(ground, octets, **stated):
 HERE = {"spacecraft_id": SPACECRAFT}
 
 
-@pytest.mark.parametrize("stated", [HERE, {**HERE, "place": PiecePosition("s", 100)}, {"instance": "twin"}])
+@mark.parametrize("stated", [HERE, {**HERE, "place": PiecePosition("s", 100)}, {"instance": "twin"}])
 def test_what_was_stated_with_a_downlink_holds_for_its_verification(ground, stated):
     """A spacecraft filter excludes the same packets; pieces with a position are joined by position."""
     octets = stream_of() + stream_of(SPACECRAFT + 1)
@@ -212,8 +212,8 @@ def test_what_was_stated_with_a_downlink_holds_for_its_verification(ground, stat
     assert (result.verdict, result.damaged) == ("intact", [])
 
 
-@pytest.mark.parametrize(
-    ("damage", "reason"),
+@mark.parametrize(
+    "damage, reason",
     [
         ("UPDATE rollups SET rows = rows + 1 WHERE level = 6", "values of its packets, found others"),
         ("DELETE FROM rollups WHERE level = 6", "expected this row, found none"),
@@ -265,7 +265,7 @@ def test_a_trend_has_the_slope_of_its_line():
     field = DICTIONARY.packet("housekeeping").field("temperature_c")
     utc_ns = np.arange(200, dtype=np.int64) * (DAY_NS // 40)
     trend = trend_of(field, downsample(utc_ns, 20.0 + 3.0 * utc_ns / DAY_NS, 50))
-    assert trend.slope_per_day == pytest.approx(3.0, rel=1e-9)
+    assert trend.slope_per_day == approx(3.0, rel=1e-9)
     assert (trend.samples, trend.limit_state) == (200, "within")
     # 62 degrees is above the warning limit of 60 of the dictionary, 90 above the alarm limit of 85
     for value, state in ((62.0, "warning"), (90.0, "alarm")):
@@ -278,7 +278,7 @@ def test_the_night_tells_trends_and_broken_limits(ground, synthetic_pass):
     ingest_file(ground, synthetic_pass.folder / "downlink.cadu")
     trends = {trend.parameter: trend for trend in spacecraft_trends(ground, 76, "flight")}
     # 0.1 degrees more every 15 s: 576 degrees a day
-    assert trends["temperature_c"].slope_per_day == pytest.approx(576.0, rel=1e-6)
+    assert trends["temperature_c"].slope_per_day == approx(576.0, rel=1e-6)
     job = enter_job(ground, "nightly", {}, job_id=nightly_job_id(DAY_NS + 5))
     assert job == enter_job(ground, "nightly", {}, job_id=nightly_job_id(DAY_NS + 99))
     assert job != nightly_job_id(2 * DAY_NS)
@@ -391,15 +391,15 @@ def finished(ground, job_id):
     return job_row(ground, job_id)
 
 
-@pytest.fixture(scope="module")
+@fixture(scope="module")
 def upgraded(postgres_url):
-    with pytest.raises(DatabaseNotMigrated, match="run 'linna db upgrade'"):
+    with raises(DatabaseNotMigrated, match="run 'linna db upgrade'"):
         prepare_database(postgres_url)
     prepare_database(postgres_url, upgrade=True).engine.dispose()
     return postgres_url
 
 
-@pytest.fixture(scope="module")
+@fixture(scope="module")
 def ground_on_postgres(upgraded, tmp_path_factory):
     with open_ground(tmp_path_factory.mktemp("pg") / "home", database_url=upgraded) as ground:
         yield ground
@@ -462,7 +462,7 @@ def test_time_outs_are_found_on_a_server_as_well(ground_on_postgres):
 
 def test_a_worker_without_a_broker_is_refused(tmp_path):
     for use in (run_worker, worker_answers):
-        with pytest.raises(SettingsError, match="LINNA_BROKER_URL: expected a broker"):
+        with raises(SettingsError, match="LINNA_BROKER_URL: expected a broker"):
             use(Settings(home=tmp_path))
 
 

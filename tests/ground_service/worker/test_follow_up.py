@@ -4,8 +4,8 @@ import json
 from concurrent.futures import ThreadPoolExecutor
 from types import SimpleNamespace
 
-import pytest
 from fastapi.testclient import TestClient
+from pytest import fixture, raises
 from sqlalchemy import update
 
 from ground_service.app import create_app
@@ -76,17 +76,17 @@ class Recorded:
         return work
 
 
-@pytest.fixture
+@fixture
 def recorded(monkeypatch):
     return Recorded(monkeypatch)
 
 
 def test_an_event_exists_only_if_its_change_was_committed(either):
-    with pytest.raises(RuntimeError), either.database.writing() as connection:
+    with raises(RuntimeError), either.database.writing() as connection:
         publish(connection, command())
         raise RuntimeError
     assert kinds(either) == []
-    with pytest.raises(RuntimeError, match="writing"):
+    with raises(RuntimeError, match="writing"):
         either.read(publish, command())
 
 
@@ -94,7 +94,7 @@ def test_numbers_have_no_gaps_and_follow_the_order_of_commits(either):
     def write(seed):
         for k in range(10):
             if (seed + k) % 3 == 0:
-                with pytest.raises(RuntimeError), either.database.writing() as connection:
+                with raises(RuntimeError), either.database.writing() as connection:
                     log.publish(connection, "test", {"lost": k})
                     raise RuntimeError
             either.write(log.publish, "test", {"seed": seed, "k": k})
@@ -120,7 +120,7 @@ def test_equal_work_of_several_events_is_done_once_and_in_order(ground, recorded
 
 
 def test_work_of_a_failed_block_is_still_done(ground, recorded):
-    with pytest.raises(RuntimeError), ground.database.listeners.held():
+    with raises(RuntimeError), ground.database.listeners.held():
         say(ground, command(3))
         raise RuntimeError
     assert recorded.done == [("advance windows", 3)]
@@ -208,7 +208,7 @@ def test_old_events_are_deleted_only_after_they_were_handled(ground, recorded):
     assert [event.number for event in events.read_events(ground.database, 0)] == [2, 3]
 
 
-@pytest.fixture(scope="module")
+@fixture(scope="module")
 def halves(make_pass, tmp_path_factory):
     """Downlink of the first three quarters of a pass, and the rest."""
     packets, folder = make_pass(frames=24, seed=6).packets, tmp_path_factory.mktemp("late")

@@ -15,7 +15,7 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from ipaddress import ip_network
 from types import SimpleNamespace
 
-import pytest
+from pytest import fixture, mark, raises
 
 from ground_service.access.store import audit_head
 from ground_service.errors import InvalidInput, ServerError
@@ -147,14 +147,14 @@ def running(server):
         server.shutdown()
 
 
-@pytest.fixture
+@fixture
 def webhook():
     receiver = Webhook()
     with running(receiver.server):
         yield receiver
 
 
-@pytest.fixture
+@fixture
 def mailbox():
     receiver = Mailbox()
     with running(receiver.server):
@@ -182,18 +182,18 @@ def test_a_webhook_that_is_out_of_order_is_tried_again_with_the_same_id(webhook,
 
 def test_a_refused_message_is_not_tried_again(webhook, tmp_path):
     webhook.statuses = [404]
-    with pytest.raises(NotDelivered, match="status 404"):
+    with raises(NotDelivered, match="status 404"):
         send(tmp_path, Channel(webhook=webhook.url))
     assert len(webhook.received) == 1
 
 
 def test_a_receiver_that_is_away_and_a_missing_key_are_stated(tmp_path):
     waited = []
-    with pytest.raises(NotDelivered, match=f"not delivered in {ATTEMPTS} attempts: ConnectError"):
+    with raises(NotDelivered, match=f"not delivered in {ATTEMPTS} attempts: ConnectError"):
         send(tmp_path, Channel(webhook="http://127.0.0.1:9/"), wait=waited.append)
     assert waited == [1.0, 2.0]
     channel = Channel(webhook="http://127.0.0.1:9/", signing_secret="hook")
-    with pytest.raises(InvalidInput, match="signing_secret, hook: expected a file in secrets of the service"):
+    with raises(InvalidInput, match="signing_secret, hook: expected a file in secrets of the service"):
         send(tmp_path, channel)
 
 
@@ -209,18 +209,18 @@ def test_an_e_mail_reaches_all_recipients(mailbox, tmp_path):
 def test_a_mail_server_that_refuses_every_recipient_is_stated(mailbox, tmp_path):
     mailbox.refusal = "550 unknown"
     channel = Channel(email=("a@b.example",), smtp=mailbox.address)
-    with pytest.raises(NotDelivered, match="SMTPRecipientsRefused"):
+    with raises(NotDelivered, match="SMTPRecipientsRefused"):
         send(tmp_path, channel)
 
 
-@pytest.fixture
+@fixture
 def local(tmp_path):
     """A service that may send to this machine."""
     with open_ground(tmp_path / "home") as opened:
         yield replace(opened, networks=HERE)
 
 
-@pytest.mark.parametrize("offers_tls", [False, True])
+@mark.parametrize("offers_tls", [False, True])
 def test_a_public_mail_server_needs_tls_with_its_certificate(mailbox, monkeypatch, tmp_path, offers_tls):
     """A message to the internet is neither readable on the way nor given to another server."""
     if offers_tls:
@@ -231,7 +231,7 @@ def test_a_public_mail_server_needs_tls_with_its_certificate(mailbox, monkeypatc
     monkeypatch.setattr(outgoing.ipaddress.IPv4Address, "is_global", property(lambda _: True))
     channel = Channel(email=("a@b.example",), smtp=mailbox.address)
     message = "SSLCertVerificationError" if offers_tls else "expected a mail server with STARTTLS"
-    with pytest.raises(NotDelivered, match=message):
+    with raises(NotDelivered, match=message):
         send(tmp_path, channel)
     assert mailbox.received == []
 
@@ -253,12 +253,12 @@ class DrippingMail(Dripping):
     octets = b"220 "
 
 
-@pytest.mark.parametrize("handler", [Dripping, DrippingMail])
+@mark.parametrize("handler", [Dripping, DrippingMail])
 def test_a_receiver_that_drips_is_left_after_the_deadline(handler, tmp_path):
     with running(socketserver.ThreadingTCPServer(("127.0.0.1", 0), handler)) as place:
         mail = Channel(email=("a@b.example",), smtp=place)
         channel = Channel(webhook=f"http://{place}/") if handler is Dripping else mail
-        with pytest.raises(NotDelivered, match="not delivered in 3 attempts"):
+        with raises(NotDelivered, match="not delivered in 3 attempts"):
             send(tmp_path, channel, deadline_s=0.3)
 
 
@@ -279,11 +279,11 @@ def test_the_body_of_an_answer_is_not_read(tmp_path):
     assert sent < 50_000_000  # what the buffers of the connection hold
 
 
-@pytest.mark.parametrize(
+@mark.parametrize(
     "host", ["127.0.0.1", "localhost", "::1", "::ffff:10.0.0.1", "10.1.2.3", "169.254.169.254", "0.0.0.0", "224.0.0.1"]
 )
 def test_an_address_that_is_not_public_is_refused(host):
-    with pytest.raises(NotDelivered, match="expected a public address or one of LINNA_NOTIFY_NETWORKS"):
+    with raises(NotDelivered, match="expected a public address or one of LINNA_NOTIFY_NETWORKS"):
         permitted_address(host, 80, ())
 
 
@@ -306,7 +306,7 @@ def test_one_private_address_of_several_refuses_a_name_and_the_checked_address_i
 
     monkeypatch.setattr(outgoing.socket, "getaddrinfo", found)
     url = webhook.url.replace("127.0.0.1", "ops.example")
-    with pytest.raises(NotDelivered, match=r"found 10\.0\.0\.1"):
+    with raises(NotDelivered, match=r"found 10\.0\.0\.1"):
         send(tmp_path, Channel(webhook=url), networks=())
     assert send(tmp_path, Channel(webhook=url)) == 1
     assert asked == ["ops.example"] * 2 and webhook.received[0][0]["Host"].startswith("ops.example:")
@@ -340,7 +340,7 @@ def test_signed_heads_that_a_webhook_and_an_e_mail_got_are_checked(webhook, mail
     (heads / "mail.eml").write_text(mailbox.received[0][1])
     now = audit_head(local)
     assert kept_heads(local, str(heads)) == [Head(now.number, now.sha256)] * 2
-    with pytest.raises(InvalidInput, match="expected a channel of a mission description in force, found none"):
+    with raises(InvalidInput, match="expected a channel of a mission description in force, found none"):
         nightly(local, {"audit_heads": "channel:none"})
 
 
@@ -382,8 +382,8 @@ def raised(vehicle=1, state="raised"):
     return AlarmChanged(id=1, vehicle_id=vehicle, name="voltage", severity="alarm", state=state)
 
 
-@pytest.mark.parametrize(
-    ("event", "texts"),
+@mark.parametrize(
+    "event, texts",
     [
         (LimitsBroken(broken=[broken(76), broken(76), broken(77)]), ["voltage low; voltage low"]),
         (LimitsBroken(broken=[broken(77)]), []),
@@ -436,12 +436,12 @@ def test_a_slow_receiver_does_not_hold_up_other_jobs(local, webhook):
         dispatcher.close()
 
 
-@pytest.fixture
+@fixture
 def settings(tmp_path, migrated_postgres):
     return Settings(home=tmp_path / "home", database_url=migrated_postgres(), allow_database_owner=True)
 
 
-@pytest.fixture
+@fixture
 def opened(settings):
     with ground_from_settings(settings) as ground:
         yield ground
@@ -471,8 +471,8 @@ def test_a_process_is_known_while_it_runs(opened, settings, monkeypatch):
     ]
 
 
-@pytest.mark.parametrize(
-    ("change", "group"),
+@mark.parametrize(
+    "change, group",
     [
         ({"objects": "s3://linna/operations"}, "files"),
         ({"broker_url": "redis://elsewhere:6379/0"}, "broker"),
@@ -486,7 +486,7 @@ def test_a_start_with_disagreeing_peers_fails(opened, settings, change, group):
     with present(opened, settings, "api"):
         with present(opened, changed(settings, port=9, host="0.0.0.0"), "worker"):
             pass  # what one process has for itself
-        refused = pytest.raises(ServerError, match=f"expected the same .*: other {group} than here")
+        refused = raises(ServerError, match=f"expected the same .*: other {group} than here")
         with refused, present(opened, other, "worker"):
             raise AssertionError
         assert len(running_processes(opened.database)) == 1

@@ -6,7 +6,7 @@ import sys
 import uuid
 from contextlib import contextmanager
 
-import pytest
+from pytest import fixture, mark, raises
 
 from ground_service.app import create_app
 from ground_service.errors import ObjectsUnavailable
@@ -30,13 +30,13 @@ from tests.serving import TestClient, wait_for
 OWN = {"Origin": "http://testserver"}
 
 
-@pytest.fixture
+@fixture
 def server():
     with running_objects(f"path-{uuid.uuid4().hex[:8]}") as running:
         yield running
 
 
-@pytest.fixture
+@fixture
 def opened(server, tmp_path):
     """A function that opens the service on a host with its own folder; by default with a database there."""
     made = []
@@ -79,7 +79,7 @@ def result_of(ground, key):
     return dict(row["result"])
 
 
-@pytest.mark.campaign
+@mark.campaign
 def test_upload_report_and_regression_on_hosts_without_a_common_folder(
     server, migrated_postgres, redis_url, make_flyable, make_build, tmp_path
 ):
@@ -151,7 +151,7 @@ def test_a_job_without_the_store_waits_and_loses_nothing(server, opened, synthet
     job = enter_job(first, "archive", {"sha256": stored.sha256, "name": "pass.zip"})
     second = opened("second", url)
     server.stop()
-    with pytest.raises(ObjectsUnavailable):
+    with raises(ObjectsUnavailable):
         run_job(second, job)
     assert job_of(first, job)["state"] == "queued"
     server.start()
@@ -170,7 +170,7 @@ def test_an_import_that_loses_the_store_half_way_is_repeated(server, opened, syn
         put(*given)
 
     monkeypatch.setattr(type(server.store()), "put", failing)
-    with pytest.raises(ObjectsUnavailable):
+    with raises(ObjectsUnavailable):
         import_archive(ground, synthetic_pass.folder)
     server.start()
     assert len(calls) == 3

@@ -1,12 +1,12 @@
 """Shortest race campaign: two API processes over HTTP and one PostgreSQL database."""
 
-import pytest
+from pytest import mark
 
 from benchmarks.campaigns import race
 from benchmarks.campaigns.race import FAULTS, Answer, Tally, holds, run, table
 
 
-@pytest.mark.campaign
+@mark.campaign
 def test_of_contradicting_requests_to_two_processes_one_wins_and_all_others_are_refused(
     new_postgres_database, tmp_path
 ):
@@ -20,7 +20,7 @@ def test_of_contradicting_requests_to_two_processes_one_wins_and_all_others_are_
     assert kinds["release"]["won"] == kinds["release"]["races"]
 
 
-@pytest.mark.parametrize("name", FAULTS)
+@mark.parametrize("name", FAULTS)
 def test_any_fault_fails_the_campaign_and_is_in_its_table(name):
     figures = {one: int(one == name) for one in FAULTS}
     assert not holds(figures)

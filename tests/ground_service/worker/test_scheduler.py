@@ -8,7 +8,7 @@ import textwrap
 from itertools import pairwise
 from unittest.mock import MagicMock, Mock
 
-import pytest
+from pytest import fixture, mark
 
 from ground_service.errors import StorageFull
 from ground_service.ground import open_ground
@@ -43,7 +43,7 @@ def make(ground, placebo_passes=0, **options):
     return Scheduler(ground, recorder, lambda: None, nightly, **options), recorder
 
 
-@pytest.fixture(autouse=True)
+@fixture(autouse=True)
 def by_day(monkeypatch):
     """A time at which no nightly job is entered."""
     monkeypatch.setattr(scheduling, "utc_now_ns", lambda: parse_utc("2029-08-07T00:10:00Z"))
@@ -126,7 +126,7 @@ def test_each_night_a_placebo_takes_kept_archives_by_turns(ground, monkeypatch):
     assert jobs.nightly_placebo(ground, 3) is None
 
 
-@pytest.mark.parametrize("hourly", [False, True])
+@mark.parametrize("hourly", [False, True])
 def test_without_the_hourly_plan_only_events_plan(ground, hourly, monkeypatch):
     monkeypatch.setattr(scheduling, "needs_plan", lambda ground: True)
     begin, (one, work) = parse_utc("2029-08-07T05:00:00Z"), make(ground, plan_hourly=hourly)
@@ -147,7 +147,7 @@ def test_the_plan_is_entered_once_an_hour_of_mission_time(ground, monkeypatch):
     assert work.submitted == [plan_job_id(begin), plan_job_id(begin + 3_600_000_000_000)]
 
 
-@pytest.mark.parametrize("error", [StorageFull("database"), ConnectionError("refused")])
+@mark.parametrize("error", [StorageFull("database"), ConnectionError("refused")])
 def test_one_part_of_the_work_that_fails_does_not_stop_the_others(ground, error, monkeypatch, caplog):
     one, work = make(ground)
     monkeypatch.setattr(scheduling, "needs_plan", lambda ground: True)

@@ -3,7 +3,7 @@
 import json
 from itertools import combinations
 
-import pytest
+from pytest import fixture, mark, raises
 from sqlalchemy import event, update
 
 from ground_service.contacts.commanding import service as commanding
@@ -130,10 +130,10 @@ insert_activity | {"release_ticks": 1, "items": [{"octet": 1}, {"octet": true}]}
 """
 
 
-@pytest.mark.parametrize("name, arguments, message", cells(REFUSED))
+@mark.parametrize("name, arguments, message", cells(REFUSED))
 def test_what_the_dictionary_refuses_is_not_queued(ground, name, arguments, message):
     given = json.loads(arguments.replace("HUGE", "1" + "0" * 400))
-    with pytest.raises(InvalidInput, match=message):
+    with raises(InvalidInput, match=message):
         enter_command(ground, name, given, spacecraft_id=SPACECRAFT, actor="ann")
     assert ground.read(list_telecommands, TelecommandFilter()).total == 0
 
@@ -145,9 +145,9 @@ def test_only_a_queued_command_can_be_decided_on(ground):
         lambda: release_command(ground, command, actor="bob"),
         lambda: reject_command(ground, command, actor="bob", reason="again"),
     ):
-        with pytest.raises(Conflict, match="expected state queued, found rejected"):
+        with raises(Conflict, match="expected state queued, found rejected"):
             decide()
-    with pytest.raises(NotFound):
+    with raises(NotFound):
         release_command(ground, 99, actor="bob")
     assert uplinked(ground) == (b"", [])
 
@@ -188,20 +188,20 @@ def test_a_time_out_is_put_on_record_once_and_stays_there(ground, tmp_path, cloc
     assert {"id": silent, "state": "timed out"} in [item.payload for item in read_events(ground.database, 0)]
 
 
-@pytest.mark.parametrize("spacecraft_id", [-1, 1024, 10**20, True])
+@mark.parametrize("spacecraft_id", [-1, 1024, 10**20, True])
 def test_an_id_that_no_transfer_frame_can_carry_is_refused(ground, spacecraft_id):
     for work in (
         lambda: enter_command(ground, "test_connection", {}, spacecraft_id=spacecraft_id, actor="ann"),
         lambda: uplinked(ground, spacecraft_id=spacecraft_id),
     ):
-        with pytest.raises(InvalidInput, match="spacecraft, id: expected 0 to 1023"):
+        with raises(InvalidInput, match="spacecraft, id: expected 0 to 1023"):
             work()
 
 
-@pytest.mark.parametrize("reason", ["", "two\nlines", "\x1b[2Jgone", "nul\x00", "x" * 501])
+@mark.parametrize("reason", ["", "two\nlines", "\x1b[2Jgone", "nul\x00", "x" * 501])
 def test_a_reason_is_one_printable_line(ground, reason):
     command = entered(ground)
-    with pytest.raises(InvalidInput, match="telecommand, reason: expected a line of 1 to 500 characters"):
+    with raises(InvalidInput, match="telecommand, reason: expected a line of 1 to 500 characters"):
         reject_command(ground, command, actor="bob", reason=reason)
     assert get_command(ground, command).state == "queued"
 
@@ -210,12 +210,12 @@ def test_arguments_nested_without_end_are_refused(ground):
     nested = 1
     for _ in range(3000):
         nested = [nested]
-    with pytest.raises(InvalidInput, match="set_parameter"):
+    with raises(InvalidInput, match="set_parameter"):
         entered(ground, "set_parameter", parameter_id=1, value=nested)
 
 
 def test_an_instance_is_one_printable_line(ground):
-    with pytest.raises(InvalidInput, match="spacecraft, instance"):
+    with raises(InvalidInput, match="spacecraft, instance"):
         enter_command(ground, "test_connection", {}, spacecraft_id=1, instance="a\nb", actor="ann")
 
 
@@ -232,8 +232,8 @@ perform_function | {"function_id": "start_observation", "argument_1": 600.0, "ar
 """
 
 
-@pytest.mark.parametrize("name, arguments, critical", cells(CRITICAL))
-@pytest.mark.parametrize("carried", [False, True])
+@mark.parametrize("name, arguments, critical", cells(CRITICAL))
+@mark.parametrize("carried", [False, True])
 def test_what_changes_the_state_of_the_payload_needs_a_second_person(ground, name, arguments, critical, carried):
     given = json.loads(arguments)
     if carried:
@@ -241,7 +241,7 @@ def test_what_changes_the_state_of_the_payload_needs_a_second_person(ground, nam
     command = enter_command(ground, name, given, spacecraft_id=SPACECRAFT, actor="ann")
     assert str(bool(get_command(ground, command).record.critical)) == critical
     if critical == "True":
-        with pytest.raises(
+        with raises(
             Conflict, match=r"critical; expected a person other than ann .*\((changes on-board state|destroys data): "
         ):
             release_command(ground, command, actor="ann")
@@ -273,7 +273,7 @@ def test_one_person_plans_approves_and_uplinks_a_routine_window(ground):
 
 def test_the_approval_of_a_window_by_somebody_else_is_the_second_person_of_its_telecommands(ground, monkeypatch):
     raise_rule(monkeypatch)
-    with pytest.raises(Conflict, match="expected a window that a second person has approved"):
+    with raises(Conflict, match="expected a window that a second person has approved"):
         uplink_window(ground, planned(ground), actor="bob")
     assert ground.read(list_telecommands, TelecommandFilter()).total == 0
     [window] = [row.id for row in ground.read(list_windows, WindowFilter()).items]
@@ -286,11 +286,11 @@ def test_who_changes_a_window_has_entered_it(ground, monkeypatch):
     raise_rule(monkeypatch)
     window = drafted(ground)
     change_window(ground, window, actor="bob", changes={"cadence_s": 20.0}, decision="approved")
-    with pytest.raises(Conflict, match="a second person"):
+    with raises(Conflict, match="a second person"):
         uplink_window(ground, window, actor="ann")
 
 
-@pytest.fixture
+@fixture
 def clock(monkeypatch):
     """A clock that stands at `NOW` until it is set."""
 
@@ -359,9 +359,7 @@ def test_a_rejection_keeps_its_reason(ground, clock):
     assert messages(ground)[-1] == {"id": command, "state": "rejected"}
 
 
-@pytest.mark.parametrize(
-    "timeout_s, accepted", [(0, False), (1, True), (2**31 - 1, True), (2**31, False), (True, False)]
-)
+@mark.parametrize("timeout_s, accepted", [(0, False), (1, True), (2**31 - 1, True), (2**31, False), (True, False)])
 def test_a_time_out_lasts_a_second_to_68_years(ground, timeout_s, accepted):
     def enter():
         return enter_command(ground, "test_connection", {}, spacecraft_id=SPACECRAFT, timeout_s=timeout_s, actor="ann")
@@ -369,13 +367,13 @@ def test_a_time_out_lasts_a_second_to_68_years(ground, timeout_s, accepted):
     if accepted:
         assert get_command(ground, enter()).record.timeout_s == timeout_s
     else:
-        with pytest.raises(InvalidInput, match=f"telecommand, timeout_s: expected 1 to 2147483647, found {timeout_s}"):
+        with raises(InvalidInput, match=f"telecommand, timeout_s: expected 1 to 2147483647, found {timeout_s}"):
             enter()
 
 
 def test_an_unknown_name_is_answered_with_the_nearest_one(ground):
     for name, near in (("test_conection", "test_connection"), ("zzz", DICTIONARY.telecommands[0].name)):
-        with pytest.raises(InvalidInput, match=f"of the dictionary, such as {near}, found '{name}'"):
+        with raises(InvalidInput, match=f"of the dictionary, such as {near}, found '{name}'"):
             entered(ground, name)
 
 
@@ -508,7 +506,7 @@ def test_an_activity_carries_the_octets_of_its_telecommand(ground, clock):
 REBOOT = {"function_id": "reboot", "argument_1": 0.0, "argument_2": 0.0}
 
 
-@pytest.mark.parametrize(
+@mark.parametrize(
     "approval, released",
     [(None, False), (commanding.Approval("ann", "ann"), False), (commanding.Approval("ann", "bob"), True)],
 )
@@ -528,7 +526,7 @@ def test_a_telecommand_released_at_once_needs_an_approval_by_two_persons(ground,
         assert get_command(ground, schedule()).record.critical == 1
     else:
         for work in (lambda: add("perform_function", REBOOT), schedule):
-            with pytest.raises(Conflict, match=r"telecommand perform_function: .*critical"):
+            with raises(Conflict, match=r"telecommand perform_function: .*critical"):
                 work()
         assert ground.read(list_telecommands, TelecommandFilter()).total == 1
     # A routine command needs nobody.
@@ -552,19 +550,19 @@ def test_nothing_is_released_or_sent_while_a_spacecraft_is_on_hold(either):
     release_command(either, released, actor="ann")
     held = hold_spacecraft(either, SPACECRAFT, "flight", reason="antenna", actor="bob")
     assert (held.held_by, held.hold_reason) == ("bob", "antenna")
-    with pytest.raises(Conflict, match=r"spacecraft 76 \(flight\): on hold by bob since .*: antenna"):
+    with raises(Conflict, match=r"spacecraft 76 \(flight\): on hold by bob since .*: antenna"):
         release_command(either, queued, actor="ann")
-    with pytest.raises(Conflict, match="on hold by bob"):
+    with raises(Conflict, match="on hold by bob"):
         uplinked(either)
     with either.database.writing() as connection:
         vehicle = get_command(either, released).record.vehicle_id
         assert take_released(connection, vehicle, SPACECRAFT, framed=True, actor="link") == (b"", [])
-    with pytest.raises(Conflict, match="on hold by bob"):
+    with raises(Conflict, match="on hold by bob"):
         hold_spacecraft(either, SPACECRAFT, "flight", reason="again", actor="ann")
     assert resume_spacecraft(either, SPACECRAFT, "flight", actor="ann").held_by is None
     release_command(either, queued, actor="ann")
     assert uplinked(either)[1] == [released, queued]
-    with pytest.raises(Conflict, match="expected a hold, found none"):
+    with raises(Conflict, match="expected a hold, found none"):
         resume_spacecraft(either, SPACECRAFT, "flight", actor="ann")
 
 
@@ -642,12 +640,12 @@ def test_every_set_of_reports_has_the_state_of_its_worst_or_furthest_one():
             assert found.timed_out is (expected not in ("failed", "completed")), subtypes
 
 
-@pytest.mark.parametrize("now_ns, overdue", [(SENT_NS + TIMEOUT_NS, False), (SENT_NS + TIMEOUT_NS + 1, True)])
+@mark.parametrize("now_ns, overdue", [(SENT_NS + TIMEOUT_NS, False), (SENT_NS + TIMEOUT_NS + 1, True)])
 def test_a_command_is_overdue_after_its_time_out_and_not_at_it(now_ns, overdue):
     assert fate_of(COMMAND, [], now_ns).timed_out is overdue
 
 
-@pytest.mark.parametrize("ticks, counts", [(100, False), (101, True), (200, True), (201, False)])
+@mark.parametrize("ticks, counts", [(100, False), (101, True), (200, True), (201, False)])
 def test_reports_made_between_sending_and_sending_again_count(ticks, counts):
     assert (fate_of(COMMAND, [report(7, ticks)], 0).state == "completed") is counts
     assert (fate_of(COMMAND, [report(7, ticks)], 0).reports == (report(7, ticks),)) is counts

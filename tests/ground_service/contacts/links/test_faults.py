@@ -6,7 +6,7 @@ import os
 import threading
 
 import numpy as np
-import pytest
+from pytest import fixture, mark, raises
 from sqlalchemy import func, select
 
 from ground_service.clock import mission_now_ns
@@ -39,7 +39,7 @@ __all__ = ["expected", "stream"]
 NS = 1_000_000_000
 
 
-@pytest.fixture(autouse=True)
+@fixture(autouse=True)
 def _short_waits(monkeypatch):
     monkeypatch.setattr(runners, "RETRY_S", 0.05)
 
@@ -130,7 +130,7 @@ def test_octets_that_were_written_in_part_are_not_written_twice(tmp_path):
     spool.keep(b"first ")
     whole = spool._stream
     spool._stream = HalfWritten(whole, 3)
-    with pytest.raises(StorageFull):
+    with raises(StorageFull):
         spool.keep(b"second")
     assert spool.size == 6
     spool._stream = whole
@@ -139,7 +139,7 @@ def test_octets_that_were_written_in_part_are_not_written_twice(tmp_path):
     assert sealed is not None and sealed.read_bytes() == b"first second"
 
 
-@pytest.mark.parametrize("renamed", [False, True])
+@mark.parametrize("renamed", [False, True])
 def test_a_segment_that_could_not_be_cut_is_kept(tmp_path, monkeypatch, renamed):
     from ground_service.ingest import live
 
@@ -155,7 +155,7 @@ def test_a_segment_that_could_not_be_cut_is_kept(tmp_path, monkeypatch, renamed)
     spool.keep(b"first ")
     with monkeypatch.context() as patch:
         patch.setattr(live, "replace_durably", broken)
-        with pytest.raises(OSError, match="Input/output"):
+        with raises(OSError, match="Input/output"):
             spool.cut()
     assert spool.size == (0 if renamed else 6)
     spool.keep(b"second")
@@ -331,7 +331,7 @@ def test_a_segment_whose_ingest_is_stopped_is_kept(tmp_path):
     spool.open()
     spool.keep(b"octets")
     spool.cut()
-    with pytest.raises(Stopping):
+    with raises(Stopping):
         spool.drain()
     assert seen == [] and len(list(tmp_path.glob("*.segment"))) == 1
 
@@ -342,6 +342,6 @@ def test_a_file_whose_ingest_is_stopped_is_read_again(tmp_path):
     path.write_bytes(b"octets")
     seen = []
     folder = WatchedFolder(tmp_path / "in", tmp_path / "ledger.json", stopping, lambda _, result: seen.append(result))
-    with pytest.raises(Stopping):
+    with raises(Stopping):
         folder.look(path.stat().st_mtime + 2 * SETTLED_S)
     assert seen == [] and not (tmp_path / "ledger.json").exists()

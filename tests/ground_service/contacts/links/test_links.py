@@ -8,7 +8,7 @@ import time
 from unittest.mock import MagicMock
 
 import numpy as np
-import pytest
+from pytest import approx, fixture, mark, raises
 from sqlalchemy import select, update
 
 from ground_service.clock import mission_now_ns, utc_now_ns
@@ -53,12 +53,12 @@ def hash_of(ground):
         return archive_hash(connection, known[0]) if known else ""
 
 
-@pytest.fixture(scope="module")
+@fixture(scope="module")
 def stream(synthetic_pass):
     return bytes((synthetic_pass.folder / "downlink.cadu").read_bytes())
 
 
-@pytest.fixture(scope="module")
+@fixture(scope="module")
 def expected(synthetic_pass, tmp_path_factory):
     with open_ground(tmp_path_factory.mktemp("whole")) as ground:
         ingest_file(ground, synthetic_pass.folder / "downlink.cadu")
@@ -115,7 +115,7 @@ def steps(runner):
         wait_for(lambda s=before: runner._sent_s > s, "the next look")
 
 
-@pytest.mark.parametrize("cut", [1, 3, 4, CADU - 1, CADU, CADU + 1, 5 * CADU + 700, 9 * CADU + 2])
+@mark.parametrize("cut", [1, 3, 4, CADU - 1, CADU, CADU + 1, 5 * CADU + 700, 9 * CADU + 2])
 def test_a_connection_that_is_cut_at_any_octet_and_continued_loses_nothing(ground, station, stream, expected, cut):
     declare(ground, station.link())
     with operated(ground) as runner:
@@ -205,7 +205,7 @@ def test_released_telecommands_are_sent_in_the_next_contact_and_not_before(eithe
 
 def test_manual_links_send_on_request_only(ground, station, stream):
     declare(ground, station.link('send = "manual"'))
-    with pytest.raises(Conflict, match="expected a process that operates it"):
+    with raises(Conflict, match="expected a process that operates it"):
         service.request_send(ground, "lab", actor="ann")
     keys = released(ground)
     with operated(ground) as runner:
@@ -219,7 +219,7 @@ def test_manual_links_send_on_request_only(ground, station, stream):
         steps(runner)
         assert len(sent_to(station)) == 1
         assert get_command(ground, later[0]).state == "released"
-    with pytest.raises(NotFound):
+    with raises(NotFound):
         service.request_send(ground, "other", actor="ann")
 
 
@@ -242,7 +242,7 @@ def test_a_link_sends_nothing_of_a_spacecraft_on_hold_and_continues_after_it(eit
         wait_for_state(either, "contact")
         steps(runner)
         assert not station.telecommands
-        with pytest.raises(Conflict, match="link lab: spacecraft 76 is on hold"):
+        with raises(Conflict, match="link lab: spacecraft 76 is on hold"):
             service.request_send(either, "lab", actor="ann")
         resume_spacecraft(either, 76, "flight", actor="ann")
         wait_for_telecommands(either, station, keys)
@@ -370,7 +370,7 @@ def records(stream, utc_ns):
     return b"".join(struct.pack(">q", utc_ns) + row for row in rows)
 
 
-@pytest.mark.parametrize("hours", [0, 1, -1])
+@mark.parametrize("hours", [0, 1, -1])
 def test_a_wrong_clock_of_the_station_is_reported_and_nothing_is_lost(ground, station, stream, expected, hours):
     declare(
         ground,
@@ -383,7 +383,7 @@ def test_a_wrong_clock_of_the_station_is_reported_and_nothing_is_lost(ground, st
         wait_for(lambda: hash_of(ground) == expected, "the same archive")
         wait_for(lambda: service.get_link(ground, "lab").clock_offset_s is not None, "the offset")
         link = service.get_link(ground, "lab")
-    assert link.clock_offset_s == pytest.approx(hours * 3600, abs=PATIENCE_OF_CLOCK_S)
+    assert link.clock_offset_s == approx(hours * 3600, abs=PATIENCE_OF_CLOCK_S)
     assert (link.reason is not None and "the clock of the station differs" in link.reason) == bool(hours)
 
 
@@ -438,7 +438,7 @@ def test_the_file_is_not_read_again_by_the_next_process(ground, tmp_path, stream
         assert runner.octets_received == 2 * CADU
 
 
-@pytest.mark.parametrize("share, missed", [(1.0, 0), (0.3, 1)])
+@mark.parametrize("share, missed", [(1.0, 0), (0.3, 1)])
 def test_a_contact_in_which_another_station_received_is_not_missed(
     ground, station, synthetic_pass, mission_time, share, missed
 ):
@@ -536,7 +536,7 @@ class Confirming(Station):
                 connection.sendall(ACKNOWLEDGEMENT.pack(answer))
 
 
-@pytest.mark.parametrize("answer", [0, 5, None])
+@mark.parametrize("answer", [0, 5, None])
 def test_a_transmission_is_repeated_with_its_number_until_the_station_confirms_it(either, confirming, stream, answer):
     station = confirming(answer, answer)
     declare(either, station.link("confirm = true"))
@@ -578,7 +578,7 @@ def test_a_transmission_that_a_station_refuses_is_sent_by_the_link_in_contact(ei
     assert detail == {"telecommands": keys, "from": "lab", "to": "other"}
 
 
-@pytest.fixture
+@fixture
 def confirming():
     """Make stations that confirm."""
     made = []
@@ -628,7 +628,7 @@ def test_telecommands_do_not_wait_for_ever_for_those_of_another_link(either, con
     assert log.warning.call_args.args[1:] == ("lab", later, "other")
 
 
-@pytest.mark.parametrize(
+@mark.parametrize(
     "change",
     [
         ('format = "packets"', ""), ('send = "manual"', ""), ('instance = "twin"', ""), ("", "released"),
@@ -690,7 +690,7 @@ time_offset = 0
 """
 
 
-@pytest.fixture(scope="module")
+@fixture(scope="module")
 def orbit():
     every = START + np.arange(-1800, 7200, 60, dtype=np.int64) * NS
     return ephemeris_from_states(every, *circular_states(every))
@@ -712,7 +712,7 @@ def downlink(orbit, station_clock_ns):
     return records
 
 
-@pytest.mark.parametrize("station_clock_s", [0, 3600, -3600])
+@mark.parametrize("station_clock_s", [0, 3600, -3600])
 def test_the_clock_is_correlated_from_time_reports_of_a_link(
     either, station, orbit, tmp_path, monkeypatch, station_clock_s
 ):
@@ -732,7 +732,7 @@ def test_the_clock_is_correlated_from_time_reports_of_a_link(
     (line,) = rows
     assert (line.points, line.rejected, line.method) == (REPORTS, 0, "time reports, light time")
     # The clock is fast by 5 ppm: a tick over an hour is 4 ppb.
-    assert line.drift_ppb == pytest.approx(-1e9 * DRIFT, abs=10.0)
+    assert line.drift_ppb == approx(-1e9 * DRIFT, abs=10.0)
     assert 0.0 < line.residual_rms_ns < line.residual_max_ns < 2 * TICK_NS
     assert {one.station for one in reports} == {"lab"}
     assert max(abs(one.residual_ns) for one in reports) < 2 * TICK_NS

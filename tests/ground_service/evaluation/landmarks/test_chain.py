@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pytest
+from pytest import fixture, mark
 
 from ground_service.evaluation.inputs import load_pass_inputs
 from ground_service.evaluation.landmarks.service import decide_landmark, uploaded_tables
@@ -47,7 +47,7 @@ class Learned:
     linna: Callable[..., Any]
 
 
-@pytest.fixture(scope="module")
+@fixture(scope="module")
 def linna(tmp_path_factory):
     """Run a command on one service; return its JSON output."""
     home = tmp_path_factory.mktemp("chain") / "home"
@@ -61,7 +61,7 @@ def linna(tmp_path_factory):
     return run
 
 
-@pytest.fixture(scope="module")
+@fixture(scope="module")
 def learned(linna, tmp_path_factory):
     """An emulated pass over a procedural Moon, imported twice as two passes, up to the decisions and exports."""
     folder = tmp_path_factory.mktemp("learned")
@@ -87,7 +87,7 @@ def learned(linna, tmp_path_factory):
     return Learned(folder, written.folder, thin, len(proposed), before["unmatched"], linna)
 
 
-@pytest.mark.campaign
+@mark.campaign
 def test_the_uploaded_table_gives_a_later_pass_more_landmarks(learned):
     """The table goes up by PUS 13, released by a second person; the flight software flies with it."""
     folder, linna = learned.folder, learned.linna

@@ -4,8 +4,7 @@ import shutil
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
-import pytest
-from pytest import approx, raises
+from pytest import approx, fixture, mark, raises
 
 from ground_service.errors import EvaluationError, InvalidInput, NotFound, StateConflict
 from ground_service.evaluation.landmarks.core import (
@@ -48,7 +47,7 @@ from tmtc.packets.large_data import LargeDataReceiver
 FRAMES = 24
 
 
-@pytest.fixture(scope="module")
+@fixture(scope="module")
 def thinned(make_pass):
     """An archive whose catalogue lacks every third crater; the catalogue with all craters, and the withheld ones.
 
@@ -116,8 +115,8 @@ camera = { pointing = "nadir", width_px = 512, height_px = 512, fov_deg = 120.0 
 """
 
 
-@pytest.mark.parametrize(
-    ("stated", "listed"),
+@mark.parametrize(
+    "stated, listed",
     [
         ('catalogue.sha256 = "{held}"', True),
         ('evidence.world = "real-terrain"', True),
@@ -227,9 +226,8 @@ def test_passes_that_agree_reduce_the_variance_not_common_to_them_and_others_enl
     assert apart.sigma_m[1] < 50.0
 
 
-@pytest.mark.parametrize(
-    ("passes", "sightings", "looks", "expected"),
-    [(2, 4, 16, True), (1, 9, 9, False), (2, 3, 3, False), (2, 4, 17, False)],
+@mark.parametrize(
+    "passes, sightings, looks, expected", [(2, 4, 16, True), (1, 9, 9, False), (2, 3, 3, False), (2, 4, 17, False)]
 )
 def test_a_landmark_is_persistent_on_two_passes_in_a_quarter_of_its_frames(passes, sightings, looks, expected):
     assert is_persistent(passes, sightings, looks) is expected
@@ -243,7 +241,7 @@ def test_places_are_the_same_within_a_quarter_of_the_diameter_or_the_uncertainty
     assert not same_place(_place(), _place(diameter_m=12_000.0))
 
 
-@pytest.mark.parametrize("error_px", [0.4, 3.0])
+@mark.parametrize("error_px", [0.4, 3.0])
 def test_the_uncertainty_is_that_of_the_errors_on_one_pass_and_on_three(error_px):
     """Withheld craters over a simulated track; the detector repeats 30 % of its variance on every pass."""
     rng = np.random.default_rng(7)
@@ -328,7 +326,7 @@ def test_the_catalogue_gets_accepted_landmarks(tmp_path):
 
 def test_labels_are_what_training_reads(tmp_path):
     (tmp_path / "labels.csv").write_text(format_labels([_landmark(1), _landmark(2, "rejected")]))
-    with pytest.raises(InvalidInput, match="expected accepted landmarks, found none among 1"):
+    with raises(InvalidInput, match="expected accepted landmarks, found none among 1"):
         format_labels([_landmark(2, "rejected")])
     labels = load_landmarks(tmp_path / "labels.csv")
     assert np.degrees(labels.latitude_rad).tolist() == [11.0]

@@ -3,8 +3,7 @@
 import math
 
 import numpy as np
-import pytest
-from pytest import approx
+from pytest import approx, mark
 
 from ground_service.evaluation.performance import core
 from ground_service.evaluation.performance.core import (
@@ -34,8 +33,8 @@ def test_a_mean_has_the_interval_of_students_t_and_a_single_pass_none():
     assert none.passes == 0 and math.isnan(none.mean)
 
 
-@pytest.mark.parametrize(
-    ("value", "name"),
+@mark.parametrize(
+    "value, name",
     [
         (19.999, "below 20 km"), (20.0, "20 to 30 km"), (39.0, "30 to 40 km"), (40.0, "40 km and above"),
         (NAN, "unknown"),
@@ -76,7 +75,7 @@ def test_constant_levels_seldom_give_a_change_and_the_rate_is_divided_among_the_
     assert change_points(values, metrics=1000) == []
 
 
-@pytest.mark.parametrize("values", [[], [1.0], [NAN] * 30, [1.0] * 30, [0.0] * 4 + [9.0] * 5])
+@mark.parametrize("values", [[], [1.0], [NAN] * 30, [1.0] * 30, [0.0] * 4 + [9.0] * 5])
 def test_nothing_is_found_in_few_or_equal_values(values):
     assert change_points(values) == []
     assert len(values) < 2 * LEAST_PASSES or len(set(map(str, values))) == 1

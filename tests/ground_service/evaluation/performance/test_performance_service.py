@@ -6,8 +6,7 @@ import threading
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import nullcontext
 
-import pytest
-from pytest import raises
+from pytest import approx, fixture, mark, raises
 
 from ground_service.client.local import local_client
 from ground_service.clock import set_mission_clock, utc_now_ns
@@ -48,7 +47,7 @@ DAY_NS = 86_400_000_000_000
 FIRST = parse_utc("2029-08-02T06:00:00Z")
 
 
-@pytest.fixture(scope="module")
+@fixture(scope="module")
 def flown(make_pass):
     return make_pass(frames=30, seed=9)
 
@@ -136,7 +135,7 @@ def test_a_report_states_the_conditions_of_its_pass(either, flown):
     pass_id = import_archive(either, flown.folder)
     made = make_report(either, pass_id)
     conditions = made.summary["conditions"]
-    assert conditions["altitude_km"] == pytest.approx(ALTITUDE_M / 1e3, abs=0.1)
+    assert conditions["altitude_km"] == approx(ALTITUDE_M / 1e3, abs=0.1)
     assert conditions["sun_elevation_deg"] is None  # the light of the images is not that of the ephemeris
     [one] = performance(either, SPACECRAFT).passes
     assert (one.pass_id, one.report_id) == (pass_id, made.report_id)
@@ -232,7 +231,7 @@ def test_months():
         month_span("2029-13")
 
 
-@pytest.fixture
+@fixture
 def september():
     set_mission_clock(lambda: parse_utc("2029-09-01T00:00:05Z"))
 
@@ -408,8 +407,8 @@ def test_operations_and_commands_give_the_same_report(ground, tmp_path, capsys):
     assert "expected passes with a report, found none" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize(
-    ("key", "values", "remark"),
+@mark.parametrize(
+    "key, values, remark",
     [
         # Twelve passes, 36 degrees of freedom: 21.34 / 36 and 54.44 / 36 (tables of chi-square).
         ("consistency.nees", [0.3] * 11 + [0.42], "mean 0.31 of 12 passes: sigmas 1.8 times too large"),

@@ -1,9 +1,9 @@
 """Time correlation: whole nanoseconds, drift, offset and outliers; what depends on it moves at once."""
 
 import numpy as np
-import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from pytest import approx, mark, raises
 
 from ground_service.errors import EvaluationError, InvalidInput, NotFound
 from ground_service.ingest.service import ingest_file
@@ -41,12 +41,12 @@ def line_of(fit):
     return TimeCorrelation(7, *(getattr(fit, name) for name in names))
 
 
-@pytest.mark.parametrize("drift_ppb", [-20_000.0, 0.0, 350.0])
+@mark.parametrize("drift_ppb", [-20_000.0, 0.0, 350.0])
 def test_offset_and_drift_of_a_clock_are_found_to_its_resolution(drift_ppb):
     """200 reports over 3.3 h, each rounded to a tick of 15 us: the drift is known to about 15 us / 6000 s = 2.5 ppb."""
     ticks, received, light = reports(drift_ppb, 3 * NS)
     fit = fit_correlation(ticks, received, light)
-    assert fit.drift_ppb == pytest.approx(drift_ppb, abs=3.0)
+    assert fit.drift_ppb == approx(drift_ppb, abs=3.0)
     assert fit.residual_rms_ns < TICK_NS
     utc, used = utc_ns_of_ticks(ticks, [line_of(fit)])
     assert np.abs(utc - (received - light)).max() < 2 * TICK_NS
@@ -59,7 +59,7 @@ def test_wrong_reports_are_left_out():
     received[[5, 77, 150]] += np.array([2, -40, 7]) * NS
     fit = fit_correlation(ticks, received, light)
     assert (fit.points, fit.rejected) == (197, 3)
-    assert fit.drift_ppb == pytest.approx(500.0, abs=3.0)
+    assert fit.drift_ppb == approx(500.0, abs=3.0)
 
 
 def test_one_report_gives_an_offset_and_none_is_refused():
@@ -67,7 +67,7 @@ def test_one_report_gives_an_offset_and_none_is_refused():
     fit = fit_correlation(ticks, received, light)
     assert (fit.points, fit.drift_ppb) == (1, 0.0)
     assert line_of(fit).utc_ns(ticks)[0] == received[0] - light[0]
-    with pytest.raises(EvaluationError, match="expected at least one time report"):
+    with raises(EvaluationError, match="expected at least one time report"):
         fit_correlation(ticks[:0], received[:0], light[:0])
 
 
@@ -113,8 +113,8 @@ CAUSES = """
 """
 
 
-@pytest.mark.parametrize("difference, cause", cells(CAUSES))
-@pytest.mark.parametrize("pattern", ["abababababababab", "bbbbaaaabbbbaaaa", "abcabcabcabcabca"])
+@mark.parametrize("difference, cause", cells(CAUSES))
+@mark.parametrize("pattern", ["abababababababab", "bbbbaaaabbbbaaaa", "abcabcabcabcabca"])
 def test_a_station_whose_clock_is_wrong_is_named_and_left_out(pattern, difference, cause):
     difference = float(difference)
     clocks = {"a": [difference] * 16, "b": [0.0] * 16, "c": [0.0] * 16}
@@ -156,7 +156,7 @@ aaaaaa | 5.5 |
 """
 
 
-@pytest.mark.parametrize("pattern, difference, remark", cells(ALONE))
+@mark.parametrize("pattern, difference, remark", cells(ALONE))
 def test_a_single_station_off_by_whole_seconds_of_a_usual_cause_decides_nothing(pattern, difference, remark):
     clocks = {"a": [float(difference)] * len(pattern)}
     kept, doubts = doubted_stations(*reports_of_stations(pattern, clocks))
@@ -193,7 +193,7 @@ def test_a_station_whose_clock_drifts_is_named_and_the_other_counts():
     assert str(doubts[1]) == "the clock of station madrid is 0.390 s ahead of the others"
 
 
-@pytest.mark.parametrize("step_s, runs", [(0.1, 1), (1.0, 2)])
+@mark.parametrize("step_s, runs", [(0.1, 1), (1.0, 2)])
 def test_two_reports_hours_apart_show_a_drift_that_an_oscillator_can_have_and_otherwise_a_step(step_s, runs):
     ticks, sent, *zero = reports_of_stations("aa", {"a": [0.0] * 2}, [0.0, step_s])[:4]
     later = np.array([0, 3 * 3600 * NS])
@@ -224,7 +224,7 @@ def test_a_correlation_holds_years_away():
     line = TimeCorrelation(1, 0, 1, int(ticks_from_utc_ns(START)), START, 0.0)
     for years in (-9, 5):
         utc_ns = START + years * 365 * 86_400 * NS
-        assert ticks_of_utc_ns(utc_ns, [line]) == pytest.approx(int(ticks_from_utc_ns(utc_ns)), abs=2)
+        assert ticks_of_utc_ns(utc_ns, [line]) == approx(int(ticks_from_utc_ns(utc_ns)), abs=2)
 
 
 def test_times_of_samples_follow_the_correlation_in_force(ground, synthetic_pass):
@@ -253,7 +253,7 @@ def test_every_boot_has_a_line_of_its_own(ground, synthetic_pass):
 
 
 def test_no_points_and_no_vehicle_are_refused(ground):
-    with pytest.raises(InvalidInput, match="expected at least one time report"):
+    with raises(InvalidInput, match="expected at least one time report"):
         correlate(ground, 1, [])
-    with pytest.raises(NotFound, match="vehicle 5"):
+    with raises(NotFound, match="vehicle 5"):
         correlate(ground, 5, [TimePoint(0, 0, 0)])

@@ -5,7 +5,7 @@ import json
 import random
 
 import numpy as np
-import pytest
+from pytest import approx, fixture, mark, raises
 from sqlalchemy import text
 
 from ground_service.access.model import AuditFilter
@@ -83,12 +83,12 @@ class Spacecraft:
         return encode_cadus(self.packets[3 * first : 3 * last], spacecraft_id=SPACECRAFT)
 
 
-@pytest.fixture(scope="module")
+@fixture(scope="module")
 def spacecraft():
     return Spacecraft()
 
 
-@pytest.fixture(autouse=True)
+@fixture(autouse=True)
 def fixed_light_time(monkeypatch):
     monkeypatch.setattr(recorrelation, "_light_time_ns", lambda *given: np.full(len(given[3]), round(LIGHT_S * NS)))
 
@@ -112,7 +112,7 @@ def test_every_boot_gets_its_line_and_every_derived_time_names_it(ground, spacec
     assert [row.boot_count for row in rows] == [7, 8]
     assert [row.points for row in rows] == [15, 15]
     for row in rows:
-        assert row.drift_ppb == pytest.approx(-3000.0, abs=20.0)  # a tick (15 us) over 14 minutes is 18 ppb
+        assert row.drift_ppb == approx(-3000.0, abs=20.0)  # a tick (15 us) over 14 minutes is 18 ppb
         assert row.residual_rms_ns < 15_259
     key = define_pass(
         ground, name="p", start_utc_ns=START - 60 * NS, stop_utc_ns=START + REPORTS * 60 * NS,
@@ -163,7 +163,7 @@ def test_a_clock_that_is_set_begins_a_new_line_and_one_bad_report_does_not():
     assert [len(one) for one in runs] == [8, 12]
 
 
-@pytest.mark.parametrize("drift_ppm", [0.0, 150.0])
+@mark.parametrize("drift_ppm", [0.0, 150.0])
 def test_a_step_during_hours_without_reports_begins_a_new_line(drift_ppm):
     """In three hours an unknown drift of 200 ppm could be 2 s; that of this clock is known from the reports before."""
     hours = np.array([0.0, 0.1, 2.0, 2.1, 4.0, 4.1, 7.0, 7.1, 10.0])
@@ -194,7 +194,7 @@ def test_what_an_operator_entered_can_be_withdrawn_with_a_trace(ground, spacecra
     vehicle = ingest(ground, tmp_path, spacecraft.downlink())
     assert ground.read(correlations_in_force, vehicle) == []
     fitted = [row.id for row in receive(ground, spacecraft.reports)]
-    with pytest.raises(Conflict, match="expected correlations in force that a person entered, found none"):
+    with raises(Conflict, match="expected correlations in force that a person entered, found none"):
         withdraw_correlations(ground, SPACECRAFT, "flight", actor="ann")
     correlate(ground, vehicle, [TimePoint(clock(START, 0), START, 0)])
     (entered,) = ground.read(correlations_in_force, vehicle)
@@ -220,9 +220,7 @@ def test_an_earlier_reception_of_the_same_report_counts(ground, spacecraft, tmp_
     for order in itertools.permutations([spacecraft.reports, played_back]):
         for reports in order:
             rows = receive(ground, reports)
-    assert [row.reference_utc_ns for row in rows] == pytest.approx(
-        [spacecraft.sent[7], spacecraft.sent[22]], abs=20_000
-    )
+    assert [row.reference_utc_ns for row in rows] == approx([spacecraft.sent[7], spacecraft.sent[22]], abs=20_000)
 
 
 def test_a_new_reference_ephemeris_gives_new_light_times(ground, spacecraft, tmp_path, monkeypatch):
@@ -271,10 +269,10 @@ packet_ticks,sequence_count,received_utc,station\n1,2,2029-08-07T06:00:00Z,Mars\
 """
 
 
-@pytest.mark.parametrize("text, message", cells(NO_FILES))
+@mark.parametrize("text, message", cells(NO_FILES))
 def test_a_file_that_is_none_is_refused_in_one_line(tmp_path, text, message):
     (tmp_path / "t.csv").write_text(text.replace(r"\n", "\n").replace(r"\ufeff", "\ufeff"))
-    with pytest.raises(InvalidInput, match=message):
+    with raises(InvalidInput, match=message):
         read_receptions(tmp_path / "t.csv")
 
 
@@ -283,7 +281,7 @@ def test_an_archive_may_have_no_receptions(tmp_path):
     assert read_receptions(tmp_path / "t.csv", 0) == []
 
 
-@pytest.mark.parametrize(
+@mark.parametrize(
     "changes, kinds",
     [
         ("reference_utc_ns = reference_utc_ns + 900", set()),  # rounding

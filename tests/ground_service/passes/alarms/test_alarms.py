@@ -2,10 +2,9 @@
 
 import itertools
 
-import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from pytest import raises
+from pytest import mark, raises
 
 from ground_service.access.model import AuditFilter
 from ground_service.access.store import list_audit
@@ -119,7 +118,7 @@ def test_a_worse_condition_must_be_acknowledged_again(ground):
         assert (alarm.state, alarm.severity) == expected
 
 
-@pytest.mark.parametrize("order", list(itertools.permutations(range(3))))
+@mark.parametrize("order", list(itertools.permutations(range(3))))
 def test_an_alarm_does_not_depend_on_the_order_of_arrival(ground, order):
     parts = [
         [housekeeping(0, 70.0), event(1)],
