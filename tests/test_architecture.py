@@ -16,6 +16,7 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
+from pytest import fixture, mark
 
 from tests import cost
 
@@ -33,7 +34,7 @@ def lint_imports(folder):
     )  # fmt: skip
 
 
-@pytest.fixture()
+@fixture()
 def copy_of_the_tree(tmp_path):
     for package in PACKAGES:
         shutil.copytree(
@@ -385,12 +386,12 @@ def made_key(path):
     return path
 
 
-@pytest.fixture
+@fixture
 def key(tmp_path):
     return made_key(tmp_path / "release.key")
 
 
-@pytest.fixture
+@fixture
 def signed(tmp_path, key):
     folder = tmp_path / "release"
     folder.mkdir()
@@ -410,7 +411,7 @@ def test_a_release_as_it_was_signed_is_accepted(signed, key):
     assert [line[66:] for line in lines] == sorted(FILES)
 
 
-@pytest.mark.parametrize("name", [*FILES, "SHA256SUMS", "SHA256SUMS.sig"])
+@mark.parametrize("name", [*FILES, "SHA256SUMS", "SHA256SUMS.sig"])
 def test_one_changed_bit_of_any_file_and_a_missing_file_are_refused(signed, key, name, capsys):
     octets = bytearray((signed / name).read_bytes())
     octets[len(octets) // 2] ^= 1
@@ -440,7 +441,7 @@ def test_a_release_signed_with_another_key_is_refused(signed, key, tmp_path):
     assert verified(signed, key) == 1
 
 
-@pytest.mark.parametrize("name", FILES)
+@mark.parametrize("name", FILES)
 def test_an_incomplete_release_is_not_signed(signed, key, name, capsys):
     (signed / name).unlink()
     assert release("sign", signed, key) == 2
@@ -489,7 +490,7 @@ def test_the_collection_imports_no_heavy_library(imported_while_collecting):
     assert imported_while_collecting == []
 
 
-@pytest.mark.parametrize(("turns", "named"), [(119.0, []), (121.0, ["a: 121 turns, limit 120"])])
+@mark.parametrize("turns, named", [(119.0, []), (121.0, ["a: 121 turns, limit 120"])])
 def test_a_folder_that_costs_a_fifth_more_than_the_table_is_named(turns, named):
     assert cost.grown({"a": 100.0, "gone": 50.0}, {"a": turns}) == named
 

@@ -25,6 +25,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
+from pytest import mark
 
 from ground_service.errors import GroundError
 from ground_service.missions.ephemerides.service import check_attitudes, load_attitudes
@@ -582,7 +583,7 @@ def outcome(name, row, folder):
     return f"SILENT: {np.nanmax(np.abs(before - after)) if before.shape == after.shape else after.shape}"
 
 
-@pytest.mark.parametrize("name", READERS)
+@mark.parametrize("name", READERS)
 def test_a_changed_field_never_gives_other_figures_in_silence(name, tmp_path):
     if name == "orientation kernels" and "LINNA_DATA" not in os.environ:
         pytest.skip("LINNA_DATA is not set: no kernels on this machine")
@@ -629,7 +630,7 @@ def keys_of(code):
     return found | {name for pair in LOOKED_UP.findall(code) for name in pair if name}
 
 
-@pytest.mark.parametrize("section", CODE)
+@mark.parametrize("section", CODE)
 def test_the_table_of_readers_has_the_names_that_the_code_reads_and_no_others(section):
     page = Path(__file__).parents[1] / "docs" / "reference" / "readers.md"
     body = page.read_text().partition(f"\n## {section}\n")[2].partition("\n## ")[0]

@@ -3,9 +3,9 @@
 import math
 
 import numpy as np
-import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from pytest import approx, mark, raises
 from scipy.special import pdtrc
 
 from lunar.camera import (
@@ -48,7 +48,7 @@ def test_projection_is_that_of_opencv_about_the_middle_and_to_half_the_field_of_
     assert np.allclose(CAMERA.project(points), theirs[:, 0], atol=1e-9)
     assert CAMERA.centre_px == (255.5, 255.5)
     edge = CAMERA.rays(np.array([511.5, 255.5]))
-    assert math.degrees(math.acos(edge[2])) == pytest.approx(60.0, abs=1e-12)
+    assert math.degrees(math.acos(edge[2])) == approx(60.0, abs=1e-12)
 
 
 @given(latitudes, longitudes, altitudes_m)
@@ -70,7 +70,7 @@ def test_what_a_pixel_sees_projects_back_into_it(latitude, longitude, altitude_m
     if np.isnan(point).any():  # the corners of the image look past the limb from high up
         assert math.hypot(u - 255.5, v - 255.5) > 255.0
         return
-    assert np.linalg.norm(point) == pytest.approx(MOON_RADIUS_M + height_m, abs=1e-6)
+    assert np.linalg.norm(point) == approx(MOON_RADIUS_M + height_m, abs=1e-6)
     # 1e-6 px is a tenth of a millimetre on the ground.
     assert np.allclose(project_mcmf(CAMERA, rotation, position, point), [u, v], atol=1e-6)
 
@@ -89,21 +89,21 @@ def test_the_range_to_the_sphere_is_that_of_the_cosine_rule(latitude, longitude,
     rotation = enu_from_mcmf(latitude, longitude)
     direction = math.sin(off_nadir) * rotation[0] - math.cos(off_nadir) * rotation[2]
     found = intersect_sphere(mcmf_from_spherical(latitude, longitude, altitude_m), direction)
-    assert found == pytest.approx(expected, abs=1e-5)
+    assert found == approx(expected, abs=1e-5)
 
 
 def test_the_way_out_of_a_sphere_is_found_and_only_what_stands_high_is_seen_over_the_horizon():
     ways = intersect_sphere(np.array([0.0, 0.0, 500.0]), np.array([[0.0, 0.0, 1.0], [0.0, 0.0, -1.0]]), 1000.0)
-    assert ways == pytest.approx([500.0, 1500.0])
+    assert ways == approx([500.0, 1500.0])
     position = mcmf_from_spherical(0.0, 0.0, 30e3)
     arc = horizon_arc_m(30e3) / MOON_RADIUS_M
     # Length of the tangent sqrt(2 R h + h^2) = 324.25 km, and R atan(324.25 / 1737.4) = 320.57 km.
-    assert arc * 1737.4 == pytest.approx(320.57, abs=0.01)
+    assert arc * 1737.4 == approx(320.57, abs=0.01)
     places = mcmf_from_spherical([0.0, 0.0, 0.0], [0.99 * arc, 1.01 * arc, 1.01 * arc], [0.0, 0.0, 500.0])
     assert above_horizon(position, places).tolist() == [True, False, True]
 
 
-@pytest.mark.parametrize("shape", [(), (0,), (1,), (2, 3)])
+@mark.parametrize("shape", [(), (0,), (1,), (2, 3)])
 def test_leading_dimensions_are_kept(shape):
     positions = np.broadcast_to(mcmf_from_spherical(0.1, 0.2, 30e3), (*shape, 3))
     rotations = nadir_camera_from_mcmf(positions)
@@ -170,7 +170,7 @@ def test_uniform_craters_follow_poisson_in_the_true_footprint():
     for n in (1, 3, 5):
         chance = pdtrc(n - 1, expected)
         # 20,000 overlapping positions over a catalogue of 79,387: three standard errors are 0.02 at most.
-        assert study.probability_at_least[n][0] == pytest.approx(chance, abs=0.02)
+        assert study.probability_at_least[n][0] == approx(chance, abs=0.02)
 
 
 def test_probabilities_grow_with_the_field_of_view_and_none_is_selected_where_none_suffices():
@@ -208,7 +208,7 @@ def test_craters_are_found_over_the_meridian_and_the_pole_and_nothing_to_study_i
     study = study_field_of_view(positions, catalogue)
     assert np.count_nonzero(np.isfinite(np.tan(np.radians(study.required_fov_deg / 2)))[0]) >= 3
     assert study.required_fov_deg[0][2] < 30.0 and study.required_fov_deg[1][1] < 30.0
-    with pytest.raises(LunarError, match="expected craters of 5-30 km under the orbit"):
+    with raises(LunarError, match="expected craters of 5-30 km under the orbit"):
         study_field_of_view(random_positions(5, 9), UNIFORM.select([]))
-    with pytest.raises(LunarError, match=r"expected fields of view in 0\.\.180 deg"):
+    with raises(LunarError, match=r"expected fields of view in 0\.\.180 deg"):
         study_field_of_view(random_positions(5, 9), UNIFORM, (190.0,))

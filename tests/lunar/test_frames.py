@@ -6,10 +6,10 @@ from pathlib import Path
 
 import erfa
 import numpy as np
-import pytest
 import spiceypy
 from hypothesis import given
 from hypothesis import strategies as st
+from pytest import approx, fixture, mark, raises
 
 from lunar.constants import ASTRONOMICAL_UNIT_M, EARTH_RADIUS_M, MOON_RADIUS_M, NS, SPEED_OF_LIGHT_M_S, SUN_RADIUS_M
 from lunar.datafolder import DataFolder, default_orientation, find_data
@@ -66,12 +66,12 @@ def angle_rad(first, second):
     return np.arcsin(np.clip(sine, 0, 1))
 
 
-@pytest.fixture(scope="module")
+@fixture(scope="module")
 def de421(data_path):
     return load_orientation(data_path / "kernels/moon_pa_de421_1900-2050.bpc", data_path / "kernels/moon_080317.tf")
 
 
-@pytest.fixture(scope="module")
+@fixture(scope="module")
 def spice_kernels(data_path):
     names = ("pck00010.tpc", "moon_pa_de421_1900-2050.bpc", "moon_080317.tf")
     for name in names:
@@ -89,8 +89,8 @@ def test_the_iau_series_is_that_of_spice_at_stored_epochs():
     assert np.max(angle_rad(ours, np.array(SPICE["rotations"]["IAU_MOON"]))) < SAME_MODEL_RAD
 
 
-@pytest.mark.real_data
-@pytest.mark.parametrize("frame", ["IAU_MOON", "MOON_PA", "MOON_ME"])
+@mark.real_data
+@mark.parametrize("frame", ["IAU_MOON", "MOON_PA", "MOON_ME"])
 def test_rotations_are_those_of_spice_with_the_same_kernels(frame, de421, spice_kernels):
     # From 1905 to 2049, both sides of every record edge that falls in between.
     epochs = np.r_[np.linspace(-3.0e9, 1.55e9, 301), de421.start_tdb_s + de421.record_s * np.arange(5000, 5010)]
@@ -102,7 +102,7 @@ def test_rotations_are_those_of_spice_with_the_same_kernels(frame, de421, spice_
     assert np.max(angle_rad(ours, spice_rotations(frame, epochs))) < SAME_MODEL_RAD
 
 
-@pytest.mark.real_data
+@mark.real_data
 def test_the_kernel_file_gives_the_constant_rotation_that_is_built_in(de421):
     assert np.max(np.abs(de421.me_from_pa @ PA_FROM_ME_DE421 - np.eye(3))) < 1e-15
 
@@ -120,7 +120,7 @@ def test_the_rotation_from_principal_to_mean_earth_axes_is_that_of_naif_and_of_9
     assert 850.0 < offset_m.max() < 900.0
 
 
-@pytest.mark.real_data
+@mark.real_data
 def test_the_iau_series_is_within_two_hundred_metres_of_de421_in_this_century(de421):
     epochs = np.linspace(0.0, 1.55e9, 500)
     apart_m = MOON_RADIUS_M * angle_rad(IauOrientation().mcmf_from_icrf(epochs), de421.mcmf_from_icrf(epochs))
@@ -183,7 +183,7 @@ def test_half_turns_have_quaternions_too():
         assert np.allclose(np.abs(quaternion_from_matrix(matrix_from_quaternion(q))), q)
 
 
-@pytest.mark.parametrize("shape", [(), (0,), (1,), (2, 3)])
+@mark.parametrize("shape", [(), (0,), (1,), (2, 3)])
 def test_rotations_keep_leading_dimensions_and_are_orthonormal(shape):
     epochs = np.full(shape, 9.0e8) + np.arange(np.prod(shape, dtype=int)).reshape(shape) * 1e5
     places = np.broadcast_to(np.array([1.0, 2.0, 3.0]), (*shape, 3))
@@ -200,19 +200,19 @@ def test_rotations_keep_leading_dimensions_and_are_orthonormal(shape):
     assert quaternion_from_matrix(rotations[0]).shape == (*shape, 4)
 
 
-@pytest.mark.real_data
+@mark.real_data
 def test_epochs_outside_the_kernel_are_refused(de421):
-    with pytest.raises(EphemerisCoverageError, match=r"DE421: expected an epoch within"):
+    with raises(EphemerisCoverageError, match=r"DE421: expected an epoch within"):
         de421.mcmf_from_icrf([0.0, 2.0e9])
 
 
-@pytest.mark.real_data
-@pytest.mark.parametrize("kept", [0, 500, 3000, 1_000_000])
+@mark.real_data
+@mark.parametrize("kept", [0, 500, 3000, 1_000_000])
 def test_a_kernel_cut_short_is_refused_with_its_name(data_path, tmp_path, kept):
     octets = (data_path / "kernels/moon_pa_de421_1900-2050.bpc").read_bytes()
     path = tmp_path / "cut.bpc"
     path.write_bytes(octets[:kept])
-    with pytest.raises(DataFileError, match=r"cut\.bpc.*expected.*found"):
+    with raises(DataFileError, match=r"cut\.bpc.*expected.*found"):
         load_orientation(path)
 
 
@@ -220,19 +220,19 @@ def test_a_file_of_another_kind_and_a_missing_one_are_refused(tmp_path):
     other = tmp_path / "other.bpc"
     other.write_bytes(b"DAF/SPK " + bytes(5000))
     for path in (other, tmp_path / "none.bpc"):
-        with pytest.raises(DataFileError, match="expected a binary PCK kernel"):
+        with raises(DataFileError, match="expected a binary PCK kernel"):
             load_orientation(path)
 
 
-@pytest.mark.real_data
+@mark.real_data
 def test_a_frame_kernel_without_the_mean_earth_frame_is_refused(data_path, tmp_path):
     path = tmp_path / "wrong.tf"
     path.write_text("KPL/FK\n\\begindata\nFRAME_31006_NAME = 'MOON_PA_DE421'\n\\begintext\n")
-    with pytest.raises(DataFileError, match="three angles of a mean-Earth frame"):
+    with raises(DataFileError, match="three angles of a mean-Earth frame"):
         load_orientation(data_path / "kernels/moon_pa_de421_1900-2050.bpc", path)
 
 
-@pytest.mark.parametrize("count", [0, 1, 40])
+@mark.parametrize("count", [0, 1, 40])
 def test_signs_of_successive_quaternions_do_not_flip(count):
     angle = 0.3 * np.arange(count)
     smooth = np.stack([np.cos(angle), np.sin(angle), 0.0 * angle, 0.0 * angle], axis=1)
@@ -240,7 +240,7 @@ def test_signs_of_successive_quaternions_do_not_flip(count):
     np.testing.assert_array_equal(continuous_quaternions(flipped), smooth)
 
 
-@pytest.fixture(scope="module")
+@fixture(scope="module")
 def day():
     """A circular polar orbit of the paper's semi-major axis, one day in 15 s steps."""
     return polar_orbit(23.999, 15.0)
@@ -251,7 +251,7 @@ def test_a_pass_within_sixty_degrees_lasts_37_minutes_and_epochs_can_be_chosen(d
     inside = np.abs(track.latitude_rad) <= math.radians(60)
     edges = np.flatnonzero(np.diff(inside.astype(int)))
     lengths = np.diff(edges)[int(inside[edges[0]]) :: 2] * 15.0 / 60.0
-    assert np.mean(lengths) == pytest.approx(111.20 / 3, abs=0.1)
+    assert np.mean(lengths) == approx(111.20 / 3, abs=0.1)
     epochs = even_epochs(day, 60.0)
     assert np.all(np.diff(epochs) == 60 * NS)
     track = ground_track(day, IauOrientation(), epochs)
@@ -270,11 +270,11 @@ def test_an_empty_folder_holds_nothing_and_what_is_no_folder_is_refused(tmp_path
     assert (data.root, data.names()) == (tmp_path, ())
     (tmp_path / "file").write_text("")
     for name in ("absent", "file"):
-        with pytest.raises(DataFileError, match="expected a data folder"):
+        with raises(DataFileError, match="expected a data folder"):
             find_data(tmp_path / name)
 
 
-@pytest.mark.real_data
+@mark.real_data
 def test_the_whole_data_folder_is_recognised(data_path):
     data = find_data(data_path)
     missing = [name for name in DataFolder.__slots__ if not getattr(data, name)]
@@ -303,7 +303,7 @@ LANDINGS = """
 """
 
 
-@pytest.mark.parametrize("landing", LANDINGS.strip().splitlines())
+@mark.parametrize("landing", LANDINGS.strip().splitlines())
 def test_the_sun_stood_where_the_apollo_crews_found_it(landing):
     landing_utc, *numbers = landing.split()
     latitude_deg, longitude_deg, sun_angle_deg = map(float, numbers)
@@ -312,9 +312,9 @@ def test_the_sun_stood_where_the_apollo_crews_found_it(landing):
     place = np.radians([latitude_deg, longitude_deg])
     elevation, azimuth = np.degrees(sun_elevation_azimuth(*place, sun_mcmf_m))
     # Sun angles are published to 0.1 deg and were rounded from mission plans: the Sun climbs 0.1 deg in 12 minutes.
-    assert elevation == pytest.approx(sun_angle_deg, abs=0.2)
+    assert elevation == approx(sun_angle_deg, abs=0.2)
     # They landed in the morning, with the Sun in the east behind them.
-    assert azimuth == pytest.approx(90.0, abs=8.0)
+    assert azimuth == approx(90.0, abs=8.0)
 
 
 def test_the_earth_shadowed_the_moon_when_the_eclipse_catalogue_says():
@@ -339,7 +339,7 @@ def test_the_sun_sets_on_a_spacecraft_within_a_penumbra_of_the_suns_width():
     fraction = sunlit_fraction(position, sun)
     assert fraction[[0, 1, 3, 4]].tolist() == [0.0, 0.0, 1.0, 1.0]
     # The limb is so large that it halves the disc like a straight edge; its curvature gives a third of a percent.
-    assert fraction[2] == pytest.approx(0.5, abs=0.005)
+    assert fraction[2] == approx(0.5, abs=0.005)
 
 
 @given(st.floats(0.0, 0.02), st.floats(0.0, 0.01), st.floats(0.001, 0.01))
@@ -354,7 +354,7 @@ def test_the_covered_share_of_a_disc_is_that_of_a_fine_grid(apart, near_radius, 
     disc = x**2 + y**2 <= far_radius**2
     covered = (x - apart) ** 2 + y**2 <= near_radius**2
     # 126,000 grid points inside the disc; its edge blurs a percent of them.
-    assert share == pytest.approx(np.count_nonzero(disc & covered) / np.count_nonzero(disc), abs=0.01)
+    assert share == approx(np.count_nonzero(disc & covered) / np.count_nonzero(disc), abs=0.01)
 
 
 def test_azimuth_runs_clockwise_from_north_and_the_subsatellite_point_undoes_the_orientation():
@@ -362,13 +362,13 @@ def test_azimuth_runs_clockwise_from_north_and_the_subsatellite_point_undoes_the
     east, north, up = enu_from_mcmf(0.3, 0.5)
     for azimuth in (0.0, 0.5, 2.0, 4.0, 6.0):
         sun = place + 1e11 * (math.sin(azimuth) * east + math.cos(azimuth) * north + math.tan(0.2) * up)
-        assert sun_elevation_azimuth(0.3, 0.5, sun) == pytest.approx((0.2, azimuth), abs=1e-9)
+        assert sun_elevation_azimuth(0.3, 0.5, sun) == approx((0.2, azimuth), abs=1e-9)
     tdb_s = tdb_s_from_utc_ns(START + np.arange(3) * 3600 * NS)
     rotation = IauOrientation().mcmf_from_icrf(tdb_s)
     position = np.einsum("nji,nj->ni", rotation, mcmf_from_spherical([0.1, -0.2, 0.3], [1.0, 2.0, -3.0], 20e3))
     latitude, longitude, altitude = subsatellite(position, tdb_s, IauOrientation())
-    assert [*latitude, *longitude] == pytest.approx([0.1, -0.2, 0.3, 1.0, 2.0, -3.0])
-    assert altitude == pytest.approx(20e3, abs=1e-6)
+    assert [*latitude, *longitude] == approx([0.1, -0.2, 0.3, 1.0, 2.0, -3.0])
+    assert altitude == approx(20e3, abs=1e-6)
 
 
 def test_the_limb_hides_the_earth_on_the_far_side_only():
@@ -383,7 +383,7 @@ def test_the_limb_hides_the_earth_on_the_far_side_only():
         position = radius * np.array([math.cos(angle), math.sin(angle), 0.0])
         assert bool(limb_clearance_m(position, earth) > 0.0) is seen
     assert limb_clearance_m([0.0, radius, 0.0], [384_400e3, radius, 0.0]) == np.inf
-    assert limb_clearance_m([-1.0, radius, 0.0], [384_400e3, radius, 0.0]) == pytest.approx(30e3)
+    assert limb_clearance_m([-1.0, radius, 0.0], [384_400e3, radius, 0.0]) == approx(30e3)
 
 
 def orbit(hours=6):
@@ -394,7 +394,7 @@ def orbit(hours=6):
 GOLDSTONE = GroundStation("DSS-14", math.radians(35.42590), math.radians(243.11046), 1002.0)
 
 
-@pytest.mark.filterwarnings("ignore:.*dubious year:erfa.ErfaWarning")
+@mark.filterwarnings("ignore:.*dubious year:erfa.ErfaWarning")
 def test_station_and_elevation_are_those_of_astropy():
     from astropy import units as u
     from astropy.coordinates import GCRS, ITRS, AltAz, CartesianRepresentation, EarthLocation
@@ -418,7 +418,7 @@ def test_station_and_elevation_are_those_of_astropy():
     leg = direction - theirs
     up = _zenith(GOLDSTONE) @ _itrf_from_icrf(utc_ns)
     # 1e-4 rad is what the Earth turns in 1.4 s.
-    assert math.asin(leg @ up / np.linalg.norm(leg)) == pytest.approx(elevation, abs=1e-4)
+    assert math.asin(leg @ up / np.linalg.norm(leg)) == approx(elevation, abs=1e-4)
 
 
 def test_range_and_light_time_are_those_of_the_signal_that_arrives():
@@ -456,11 +456,11 @@ def test_the_spacecraft_is_behind_the_moon_about_half_of_a_revolution_that_faces
 
 
 def test_a_link_before_the_ephemeris_starts_is_refused():
-    with pytest.raises(EphemerisCoverageError):
+    with raises(EphemerisCoverageError):
         link(orbit(), START)
 
 
-@pytest.mark.parametrize("shape", [(), (0,), (1,), (2, 3)])
+@mark.parametrize("shape", [(), (0,), (1,), (2, 3)])
 def test_links_keep_leading_dimensions(shape):
     found = link(orbit(), np.full(shape, START + 3600 * NS), GOLDSTONE)
     assert found.visible.shape == found.range_m.shape == found.elevation_rad.shape == shape
@@ -477,7 +477,7 @@ def test_windows_are_found_to_the_tolerance_and_may_reach_the_ends():
     assert windows.shape == (3, 2) and np.max(np.abs(windows.ravel() - edges)) <= 1000
     assert find_windows(lambda t: t < 0, first, last) == []
     assert find_windows(lambda t: t > 0, first, last) == [(first, last)]
-    with pytest.raises(LunarError, match="expected a stop after the start"):
+    with raises(LunarError, match="expected a stop after the start"):
         find_windows(condition, last, first)
 
 

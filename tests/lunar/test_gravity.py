@@ -6,8 +6,8 @@ import sys
 from pathlib import Path
 
 import numpy as np
-import pytest
 from mpmath import atan2, cos, mp, mpf, sin, sqrt
+from pytest import approx, mark, raises
 
 from lunar import _gravity_kernel as kernel
 from lunar.errors import DataFileError, OrbitError
@@ -59,7 +59,7 @@ def at(latitude_deg, longitude_deg, altitude_km=30.0):
     return r * np.array([math.cos(lat) * math.cos(lon), math.cos(lat) * math.sin(lon), math.sin(lat)])
 
 
-@pytest.mark.parametrize("place", [at(37.0, -101.0), at(-89.2, 12.0), at(1e-3, 200.0, 14.0)])
+@mark.parametrize("place", [at(37.0, -101.0), at(-89.2, 12.0), at(1e-3, 200.0, 14.0)])
 def test_degree_100_agrees_with_an_evaluation_in_fifty_digits(place):
     field = kaula_field(100)
     expected = exact_acceleration(field, place, 100)
@@ -67,7 +67,7 @@ def test_degree_100_agrees_with_an_evaluation_in_fifty_digits(place):
     assert np.linalg.norm(acceleration(field, place) - expected) <= 5e-15 * np.linalg.norm(expected)
 
 
-@pytest.mark.parametrize("degree", [*range(13), 20, 31, 32, 33])
+@mark.parametrize("degree", [*range(13), 20, 31, 32, 33])
 def test_every_degree_agrees_with_the_definition_whatever_the_number_of_blocks(degree):
     field = kaula_field(33)
     place = at(-21.0, 77.0, 100.0)
@@ -101,7 +101,7 @@ def test_oblateness_pulls_as_in_the_closed_form():
     assert np.allclose(found + gm * np.array([x, y, z]) / r**3, expected, rtol=1e-11, atol=1e-16)
 
 
-@pytest.mark.parametrize("degree", [0, 1, 2, 8, 40])
+@mark.parametrize("degree", [0, 1, 2, 8, 40])
 def test_the_gradient_is_the_change_of_the_acceleration(degree):
     field = kaula_field(40)
     place, step = at(-63.0, 140.0), 10.0
@@ -155,7 +155,7 @@ def test_truncation_asks_for_a_degree_the_field_has_and_the_built_in_one_says_wh
     assert field.truncated(3).degree == 3
     assert field.truncated(5) is field
     for degree in (6, -1):
-        with pytest.raises(OrbitError, match=f"expected a degree from 0 to 5, found {degree}"):
+        with raises(OrbitError, match=f"expected a degree from 0 to 5, found {degree}"):
             acceleration(field, at(0, 0), degree)
     assert packed(field, 3) is packed(field, 3)
     field = builtin_gravity()
@@ -164,10 +164,10 @@ def test_truncation_asks_for_a_degree_the_field_has_and_the_built_in_one_says_wh
     # (B - A)/(M R^2) = 4 C22 over (B - A)/C = 227.7317e-6 (Williams et al. 2014, doi 10.1002/2013JE004559) must be the
     # polar moment of inertia C/(M R^2) = 0.3931 +- 0.0002 (Konopliv et al. 1998, Science 281:1476).
     c22 = field.c_bar[2, 2] * math.sqrt(5.0 / 12.0)
-    assert 4.0 * c22 / 227.7317e-6 == pytest.approx(0.3931, abs=0.0002)
+    assert 4.0 * c22 / 227.7317e-6 == approx(0.3931, abs=0.0002)
 
 
-@pytest.mark.real_data
+@mark.real_data
 def test_the_built_in_field_agrees_with_other_fields(data_path):
     builtin = builtin_gravity()
     for name, tolerance in (("GRGM660PRIM_to150.gfc", 1e-8), ("LP165P.cof", 5e-7)):
@@ -177,7 +177,7 @@ def test_the_built_in_field_agrees_with_other_fields(data_path):
         assert np.abs(other.s_bar - builtin.s_bar).max() < tolerance
 
 
-@pytest.mark.real_data
+@mark.real_data
 def test_published_files_are_read_to_their_last_line(data_path):
     grail = load_gravity(data_path / "gravity" / "GRGM660PRIM_to150.gfc")
     assert (grail.name, grail.degree, grail.gm_m3_s2, grail.radius_m) == (
@@ -231,7 +231,7 @@ a field, for tests
 SHTOOLS_KM = "1.738E+03, 4.9E+03, 2.66E-06, 2, 2\n" + SHADR.partition("\n")[2]
 
 
-@pytest.mark.parametrize(
+@mark.parametrize(
     "text", [ICGEM, COF, SHADR, SHTOOLS, SHTOOLS_KM], ids=["icgem", "cof", "shadr", "pyshtools", "pyshtools in km"]
 )
 def test_the_formats_hold_the_same_field(text, tmp_path):
@@ -281,18 +281,18 @@ hello¶ |  |  | an ICGEM, GMAT .cof, PDS SHADR or pyshtools gravity field
 }
 
 
-@pytest.mark.parametrize("text, row", [(text, row) for text in FAULTS for row in FAULTS[text].strip("\n").splitlines()])
+@mark.parametrize("text, row", [(text, row) for text in FAULTS for row in FAULTS[text].strip("\n").splitlines()])
 def test_a_bad_file_is_named_with_the_place_and_what_was_expected(text, row, tmp_path):
     old, new, where, expected = row.replace("¶", "\n").split(" | ")
     assert old in text
     path = tmp_path / "bad.field"
     path.write_text(text.replace(old, new))
-    with pytest.raises(DataFileError) as caught:
+    with raises(DataFileError) as caught:
         load_gravity(path)
     assert where in caught.value.where and expected in caught.value.expected
     assert str(path) in str(caught.value) and "\n" not in str(caught.value)
 
 
 def test_a_missing_file_is_named(tmp_path):
-    with pytest.raises(DataFileError, match=r"nowhere\.gfc: expected a gravity field file"):
+    with raises(DataFileError, match=r"nowhere\.gfc: expected a gravity field file"):
         load_gravity(tmp_path / "nowhere.gfc")

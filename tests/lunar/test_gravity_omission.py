@@ -3,8 +3,8 @@
 from dataclasses import dataclass
 
 import numpy as np
-import pytest
 from numpy.testing import assert_allclose
+from pytest import approx, mark
 from scipy.special import eval_legendre
 
 from lunar import gravity_omission as noise_model
@@ -92,7 +92,7 @@ def test_the_same_field_lacks_nothing():
     assert not np.any([found.psd_m2_s3, found.rms_m_s2])
 
 
-@pytest.mark.parametrize("degree", [20, 80])
+@mark.parametrize("degree", [20, 80])
 def test_only_slow_waves_count(degree):
     """A zonal term of degree n goes as P_n(sin latitude): how much of that lies below 31 waves a circle."""
     found = measured_omission(zonal_field(degree, 1e-6), zonal_field(0, 1.0), revolutions=40)
@@ -101,7 +101,7 @@ def test_only_slow_waves_count(degree):
     expected = power[1:31].sum() / power[: 4_096 // 2].sum()
     period_s = 2.0 * np.pi * np.sqrt(1_768_180.0**3 / GM)
     slow = found.psd_m2_s3[0] * 2.0 * 30.0 / period_s / found.rms_m_s2[0] ** 2
-    assert slow == pytest.approx(expected, rel=0.1)
+    assert slow == approx(expected, rel=0.1)
 
 
 def test_density_of_a_zonal_term_against_its_closed_form():
@@ -110,10 +110,10 @@ def test_density_of_a_zonal_term_against_its_closed_form():
     found = measured_omission(zonal_field(2, c), zonal_field(0, 1.0), revolutions=60)
     # Mean square of P2(sin) around a circle is 11/32.
     expected = 3.0 * GM / 1_768_180.0**2 * (RADIUS / 1_768_180.0) ** 2 * c * np.sqrt(5.0) * np.sqrt(11.0 / 32.0)
-    assert found.rms_m_s2[0] == pytest.approx(expected, rel=0.01)
+    assert found.rms_m_s2[0] == approx(expected, rel=0.01)
 
 
-@pytest.mark.parametrize("name, degree", [("GRGM", 20), ("GRGM", 100), ("LP165P", 100)])
+@mark.parametrize("name, degree", [("GRGM", 20), ("GRGM", 100), ("LP165P", 100)])
 def test_noise_by_altitude_has_the_mean_over_the_orbit_that_the_table_gives(name, degree):
     """Averaged over the paper's orbit (30.8 km, +-12.2 km), by adding it up; the far side is one field's alone."""
     noise, near, far = field_noise(name, degree), *field_psd_m2_s3(name, degree)
@@ -133,7 +133,7 @@ def test_noise_by_altitude_has_the_mean_over_the_orbit_that_the_table_gives(name
     assert (noise.near_psd_m2_s3 == noise.far_psd_m2_s3) is (name == "GRGM")
 
 
-@pytest.mark.real_data
+@mark.real_data
 def test_what_a_cut_omits_falls_with_altitude_as_the_filter_holds(data_path):
     truth = load_gravity(find_data(data_path).gravity).truncated(150)
     angle = np.linspace(0.0, 2.0 * np.pi, 1_024, endpoint=False)[:, None]
@@ -147,19 +147,19 @@ def test_what_a_cut_omits_falls_with_altitude_as_the_filter_holds(data_path):
         )
         # Mean squares fall a little faster than the slow waves: by the ratio over 31 km to a tenth.
         found = 31e3 / np.log(low / high)
-        assert field_noise("GRGM", degree).near_scale_height_m == pytest.approx(found, rel=0.12)
+        assert field_noise("GRGM", degree).near_scale_height_m == approx(found, rel=0.12)
 
 
-@pytest.mark.real_data
+@mark.real_data
 def test_the_table_of_the_filter_is_what_is_measured(data_path):
     truth = load_gravity(find_data(data_path).gravity).truncated(150)
     for degree in (20, 50, 70, 100):
         found = measured_omission(truth, truth.truncated(degree))
-        assert found.psd_m2_s3 == pytest.approx(omission_psd_m2_s3(degree), rel=0.35), degree
+        assert found.psd_m2_s3 == approx(omission_psd_m2_s3(degree), rel=0.35), degree
 
 
-@pytest.mark.real_data
-@pytest.mark.parametrize("inclination_deg", [89.0, 60.0])
+@mark.real_data
+@mark.parametrize("inclination_deg", [89.0, 60.0])
 def test_errors_of_an_older_field_over_the_far_side_grow_with_the_obliqueness_of_the_track(data_path, inclination_deg):
     products = find_data(data_path)
     truth, other = load_gravity(products.gravity), load_gravity(products.gravity_alternative)

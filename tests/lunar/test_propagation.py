@@ -6,8 +6,8 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-import pytest
 from numpy.testing import assert_allclose, assert_array_equal
+from pytest import approx, mark, raises
 
 from lunar import _dynamics_kernel
 from lunar._tableaux import DOP853_A, DOP853_B, DOP853_C
@@ -49,9 +49,9 @@ INITIAL = state_from_elements(TABLE_I, GM)
 
 def test_elements_come_back_from_their_state_and_a_point_mass_gives_the_orbit_of_kepler():
     back = elements_from_state(*INITIAL, GM)
-    assert back.semi_major_axis_m == pytest.approx(TABLE_I.semi_major_axis_m, abs=1e-5)  # m
+    assert back.semi_major_axis_m == approx(TABLE_I.semi_major_axis_m, abs=1e-5)  # m
     for name in ("eccentricity", "inclination_rad", "raan_rad", "argument_of_perilune_rad", "true_anomaly_rad"):
-        assert getattr(back, name) == pytest.approx(getattr(TABLE_I, name), abs=1e-11), name
+        assert getattr(back, name) == approx(getattr(TABLE_I, name), abs=1e-11), name
     trajectory = propagate(EPOCH_S, *INITIAL, 86_400.0, KEPLER)
     for elapsed_s in (0.0, 1_234.5, 40_000.0, 86_400.0):
         error_m = np.linalg.norm(
@@ -69,7 +69,7 @@ def test_methods_of_different_families_agree_over_a_day():
 
 def test_an_orbit_into_the_ground_stops_with_the_place_of_impact():
     falling = Elements(MOON_RADIUS_M - 10_000.0, 0.03, math.radians(89.0), 0.0, 0.0, math.pi)
-    with pytest.raises(ImpactError) as end:
+    with raises(ImpactError) as end:
         propagate(EPOCH_S, *state_from_elements(falling, GM), 7_200.0, KEPLER)
     # Kepler: the radius meets the sphere where 1 + e cos(nu) = p / R.
     p = falling.semi_major_axis_m * (1 - falling.eccentricity**2)
@@ -78,7 +78,7 @@ def test_an_orbit_into_the_ground_stops_with_the_place_of_impact():
     mean = anomaly - 0.03 * math.sin(anomaly)
     expected_s = (mean - math.pi) * math.sqrt(falling.semi_major_axis_m**3 / GM)
     impact_s = float(tdb_s_from_utc_ns(end.value.utc_ns)) - EPOCH_S
-    assert impact_s == pytest.approx(expected_s, abs=0.01)  # s
+    assert impact_s == approx(expected_s, abs=0.01)  # s
     assert "\n" not in str(end.value)
 
 
@@ -91,8 +91,8 @@ def test_burns_bring_the_orbit_back_to_the_rule():
     assert len(burns) % 2 == 0
     assert altitude_m.min() > 10e3  # m: one arc below 15 km calls for the pair of burns, none goes far below
     after = burns[1].after
-    assert after.semi_major_axis_m == pytest.approx(rule.semi_major_axis_m, abs=200.0)  # m, osculating
-    assert after.eccentricity == pytest.approx(rule.eccentricity, abs=2e-4)
+    assert after.semi_major_axis_m == approx(rule.semi_major_axis_m, abs=200.0)  # m, osculating
+    assert after.eccentricity == approx(rule.eccentricity, abs=2e-4)
 
 
 def test_earth_and_sun_stand_where_the_eclipse_of_2018_had_them():
@@ -103,7 +103,7 @@ def test_earth_and_sun_stand_where_the_eclipse_of_2018_had_them():
     earth, sun = earth_position_icrf_m(tdb_s), sun_position_icrf_m(tdb_s)
     axis = (earth - sun) / np.linalg.norm(earth - sun)
     off_axis_m = np.linalg.norm(earth - (earth @ axis) * axis)
-    assert off_axis_m == pytest.approx(0.1168 * 6_378_137.0, abs=50e3)
+    assert off_axis_m == approx(0.1168 * 6_378_137.0, abs=50e3)
 
 
 DARK = ForceModel(builtin_gravity(), IauOrientation(), 0)
@@ -138,8 +138,8 @@ def test_sunlight_pushes_away_from_the_sun_with_the_pressure_of_its_flux():
     distance_au = np.linalg.norm(sun_position_icrf_m(EPOCH_S) - place) / 149_597_870_700.0
     # Total solar irradiance 1361 W/m^2 at 1 au (Kopp and Lean 2011) over the speed of light.
     expected = 1361.0 / SPEED_OF_LIGHT_M_S / distance_au**2 * 0.02 * 1.4
-    assert np.linalg.norm(push) == pytest.approx(expected, rel=1e-6)
-    assert push @ sunward() == pytest.approx(-expected, rel=1e-6)
+    assert np.linalg.norm(push) == approx(expected, rel=1e-6)
+    assert push @ sunward() == approx(-expected, rel=1e-6)
 
 
 def test_sunlight_ends_in_the_moons_shadow_and_is_halved_on_its_edge():
@@ -150,7 +150,7 @@ def test_sunlight_ends_in_the_moons_shadow_and_is_halved_on_its_edge():
     depth_m = math.sqrt(RADIUS_M**2 - MOON_RADIUS_M**2)
     edge = MOON_RADIUS_M * across - depth_m * sunward()
     # The Sun is 390 times as far as the Moon is wide: the tangent leans by R / 1 au = 1.2e-5 rad, 0.3 % of the disc.
-    assert np.linalg.norm(pushed(edge)) == pytest.approx(0.5 * lit, rel=0.02)
+    assert np.linalg.norm(pushed(edge)) == approx(0.5 * lit, rel=0.02)
 
 
 def test_sunlight_moves_a_low_orbit_by_what_its_push_does_in_ten_minutes():
@@ -162,7 +162,7 @@ def test_sunlight_moves_a_low_orbit_by_what_its_push_does_in_ten_minutes():
     f, n = np.linalg.norm(pushed(place)), speed / RADIUS_M
     expected_m = f / n**2 * math.hypot(1 - math.cos(600 * n), 2 * (600 * n - math.sin(600 * n)))
     # The push turns with the Sun, not with the orbit: 0.57 rad over the ten minutes.
-    assert np.linalg.norm(lit[:3] - dark[:3]) == pytest.approx(expected_m, rel=0.1)
+    assert np.linalg.norm(lit[:3] - dark[:3]) == approx(expected_m, rel=0.1)
 
 
 def test_the_coefficients_of_transition_matrices_are_those_of_scipy():
@@ -172,7 +172,7 @@ def test_the_coefficients_of_transition_matrices_are_those_of_scipy():
         assert_array_equal(ours, theirs)
 
 
-@pytest.mark.parametrize("duration_s", [900.0, -900.0])
+@mark.parametrize("duration_s", [900.0, -900.0])
 def test_the_transition_matrix_is_the_change_of_the_end_with_the_start(duration_s):
     start = np.concatenate(INITIAL)
     position, velocity, matrix = propagate_with_stm(
@@ -199,7 +199,7 @@ def tide(gm, body_m, orbiter_m):
     return gm * (away / np.linalg.norm(away) ** 3 - body_m / np.linalg.norm(body_m) ** 3)
 
 
-@pytest.mark.parametrize("body", ["earth", "sun"])
+@mark.parametrize("body", ["earth", "sun"])
 def test_pulls_on_a_low_orbit_are_those_of_de421(body):
     position, gm = {"earth": (earth_position_icrf_m, GM_EARTH_M3_S2), "sun": (sun_position_icrf_m, GM_SUN_M3_S2)}[body]
     rng = np.random.default_rng(1)
@@ -241,15 +241,15 @@ def test_an_ephemeris_does_not_differ_from_itself():
 
 def test_a_larger_orbit_differs_radially_a_late_one_along_track_and_a_shifted_one_across():
     radial = compare(ephemeris(), ephemeris(radius_m=1_768_280.0))
-    assert radial.rms_rtn_m == pytest.approx((100.0, 0.0, 0.0), abs=1e-6)
+    assert radial.rms_rtn_m == approx((100.0, 0.0, 0.0), abs=1e-6)
     late = compare(ephemeris(), ephemeris(late_s=0.1))
     # 0.1 s at 1.665 km/s, behind; the sagitta is 8 mm.
-    assert late.position_rtn_m[:, 1] == pytest.approx(-RADIUS_M * RATE_RAD_S * 0.1, abs=1e-3)
+    assert late.position_rtn_m[:, 1] == approx(-RADIUS_M * RATE_RAD_S * 0.1, abs=1e-3)
     assert late.rms_rtn_m[0] < 0.01
     # Normal of this orbit is x cross z = -y.
     across = compare(ephemeris(), ephemeris(shift_m=(0.0, 3.0, 0.0)))
-    assert across.position_rtn_m[:, 2] == pytest.approx(-3.0, abs=1e-6)
-    assert (across.max_m, across.rms_m) == pytest.approx((3.0, 3.0), abs=1e-6)
+    assert across.position_rtn_m[:, 2] == approx(-3.0, abs=1e-6)
+    assert (across.max_m, across.rms_m) == approx((3.0, 3.0), abs=1e-6)
 
 
 def test_common_or_given_epochs_count_and_other_steps_are_interpolated():
@@ -259,5 +259,5 @@ def test_common_or_given_epochs_count_and_other_steps_are_interpolated():
     epochs = START + np.array([100, 200, 300]) * NS
     assert compare(ephemeris(), ephemeris(), epochs).samples == 3
     for other, asked in ((ephemeris(), epochs + 86_400 * NS), (ephemeris(ELAPSED_S + 1e6), None)):
-        with pytest.raises(EphemerisCoverageError, match="expected an epoch within"):
+        with raises(EphemerisCoverageError, match="expected an epoch within"):
             compare(ephemeris(), other, asked)

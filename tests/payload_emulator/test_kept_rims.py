@@ -4,7 +4,7 @@ import os
 from dataclasses import replace
 
 import numpy as np
-import pytest
+from pytest import fixture
 
 from lunar.catalogue import make_catalogue
 from lunar.datafolder import DataFolder
@@ -18,7 +18,7 @@ SCENARIO = Scenario(name="rims", seed=5)
 ALL = np.arange(6)
 
 
-@pytest.fixture(autouse=True)
+@fixture(autouse=True)
 def folder(tmp_path, monkeypatch):
     opened().measured(ALL[:1])  # compiled code comes from its own folder
     # Ground lies next to the folder of compiled code, which builds under test read.

@@ -3,7 +3,7 @@
 from dataclasses import replace
 
 import numpy as np
-import pytest
+from pytest import approx, mark, raises
 
 from lunar.ephemeris import ephemeris_from_states
 from lunar.third_bodies import earth_position_icrf_m
@@ -78,8 +78,8 @@ LINKS = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("name", sorted(LINKS))
-@pytest.mark.parametrize("coding", ["rs", "none"])
+@mark.parametrize("name", sorted(LINKS))
+@mark.parametrize("coding", ["rs", "none"])
 def test_the_account_of_the_link_is_the_account_of_the_ground(name, coding):
     sender = transmitter(coding)
     section = replace(LINKS[name], coding=coding)
@@ -106,7 +106,7 @@ def test_errors_come_in_bursts_of_the_length_that_is_asked_for():
         lost += account["frames_lost_on_link"]
         frames += account["frames_sent"]
     # Share of time in the bad state of a two-state chain: 0.05 / (0.05 + 0.25); 3 sigma of so many correlated frames.
-    assert lost / frames == pytest.approx(1 / 6, abs=0.03)
+    assert lost / frames == approx(1 / 6, abs=0.03)
 
 
 def test_the_receiver_reports_what_it_accepted_and_whether_it_hears_anybody():
@@ -151,7 +151,7 @@ def test_contacts_end_behind_the_limb_of_the_moon_once_an_orbit():
     in_contact, light_s = contacts(ephemeris, times, every)
     # The plane holds the Earth: hidden for the angle 180 deg - 2 acos(R / r), R / r = 1737.4 / 1767.4, of each orbit.
     hidden = (np.pi - 2.0 * np.arccos(1737.4 / 1767.4)) / (2.0 * np.pi)
-    assert 1.0 - in_contact.mean() == pytest.approx(hidden, abs=0.04)
+    assert 1.0 - in_contact.mean() == approx(hidden, abs=0.04)
     assert np.all((light_s > 1.1) & (light_s < 1.4))
     always, way_s = contacts(ephemeris, times, LinkSection())
     assert always.all()
@@ -162,5 +162,5 @@ def test_contacts_end_behind_the_limb_of_the_moon_once_an_orbit():
 
 
 def test_a_station_that_there_is_not_is_named():
-    with pytest.raises(ScenarioError, match=r"expected names of goldstone, .* found 'atlantis'"):
+    with raises(ScenarioError, match=r"expected names of goldstone, .* found 'atlantis'"):
         station("atlantis")

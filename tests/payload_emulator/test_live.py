@@ -11,7 +11,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-import pytest
+from pytest import fixture, mark, raises
 
 from lunar.camera import project_mcmf
 from lunar.datafolder import find_data
@@ -48,7 +48,7 @@ NO_DATA = find_data(None)
 EPOCH = parse_utc("2029-08-07T01:40:00Z")
 
 
-@pytest.fixture(scope="module")
+@fixture(scope="module")
 def flown():
     world = build_world(parse_scenario(SCENARIO), NO_DATA)
     return world, load_scenario_payload(world, NO_DATA)[0]
@@ -110,7 +110,7 @@ def watched(world, loaded):
     assert not thread.is_alive()
 
 
-@pytest.fixture
+@fixture
 def running(flown):
     with watched(*flown) as both:
         yield both
@@ -228,7 +228,7 @@ def test_a_port_in_use_is_named_and_nothing_stays_open(flown):
     world, loaded = flown
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
-        with pytest.raises(LinkError, match=f"telecommand of earth port {port}: expected a free port"):
+        with raises(LinkError, match=f"telecommand of earth port {port}: expected a free port"):
             LiveSession(world, loaded, has_operator=True, station_ports={"earth": (0, port)})
 
 
@@ -331,7 +331,7 @@ def test_a_reader_that_does_not_read_is_disconnected_and_delays_nobody():
     selector.close()
 
 
-@pytest.mark.parametrize("leave", [socket.socket.close, reset], ids=["closed", "reset"])
+@mark.parametrize("leave", [socket.socket.close, reset], ids=["closed", "reset"])
 def test_words_of_a_client_that_left_without_reading_are_received(leave):
     received = []
     server = Server("console", 0, "127.0.0.1", lambda number, octets: received.append(octets))

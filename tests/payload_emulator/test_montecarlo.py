@@ -5,6 +5,8 @@ from functools import partial
 
 import numpy as np
 import pytest
+from numpy.testing import assert_array_equal
+from pytest import approx, fixture, mark
 from scipy.special import chdtri
 
 from lunar.constants import MOON_RADIUS_M
@@ -34,7 +36,7 @@ PARAMETERS = AnchoredParameters(
 )
 
 
-@pytest.fixture
+@fixture
 def case_of(navigation_case):
     return partial(navigation_case, parameters=PARAMETERS)
 
@@ -52,7 +54,7 @@ def test_from_five_kilometres_off_the_orbit_is_held_to_a_hundred_metres_without_
 GOOD = Consistency(6.1, 1.0, (0.95, 0.96, 0.94), 0.01, 40.0, 80.0, 120.0, 0.99, 0.001)
 
 
-@pytest.mark.parametrize(
+@mark.parametrize(
     "fault, words",
     [
         ({"anees": 7.1}, "ANEES 7.10 outside 5.04 to 6.96"),
@@ -104,7 +106,7 @@ def test_an_attitude_of_a_degree_neither_diverges_nor_lies(case_of):
     assert 0.9 <= result.nis_per_degree <= 1.1
 
 
-@pytest.mark.parametrize("seed", [1, *(pytest.param(one, marks=pytest.mark.campaign) for one in (2, 3))])
+@mark.parametrize("seed", [1, *(pytest.param(one, marks=mark.campaign) for one in (2, 3))])
 def test_an_unannounced_jump_of_five_kilometres_is_noticed_and_mended(case_of, seed):
     case = case_of(80, kidnap=Kidnap(50, 5_000.0, announced=False))
     run = fly(case, seed)
@@ -154,13 +156,13 @@ def test_the_same_seed_gives_the_same_run_on_any_number_of_processes(case_of):
     case = case_of(12)
     alone, together = fly_many(case, [1, 2], workers=1), fly_many(case, [1, 2], workers=2)
     for one, other in zip(alone, together, strict=True):
-        np.testing.assert_array_equal(one.error_rtn_m, other.error_rtn_m)
+        assert_array_equal(one.error_rtn_m, other.error_rtn_m)
 
 
 SHIPPED_RUNS, SHIPPED_HOURS = 4, 0.5
 
 
-@pytest.fixture(scope="module")
+@fixture(scope="module")
 def shipped():
     """The standard case with everything as shipped: bias states, catalogue offset, scale, persistence, noise."""
     case = standard_case(DataFolder(), "tuning", SHIPPED_HOURS)
@@ -174,7 +176,7 @@ def shipped_consistency(case):
     return consistency([fly(case, seed) for seed in range(31, 31 + SHIPPED_RUNS)], settle_frames=40)
 
 
-@pytest.mark.parametrize("distorted", [False, True])
+@mark.parametrize("distorted", [False, True])
 def test_the_shipped_filter_knows_its_errors(shipped, distorted):
     case = shipped
     if distorted:
@@ -189,7 +191,7 @@ def test_the_shipped_filter_knows_its_errors(shipped, distorted):
     assert result.fixed_share >= 0.95 and result.wrong_share <= 0.01
 
 
-@pytest.mark.parametrize("believed", [1.0, 0.05])
+@mark.parametrize("believed", [1.0, 0.05])
 def test_craters_that_the_payload_mapped_are_met_again_and_their_errors_known(monkeypatch, believed):
     rows = landmark_map.map_rows
     monkeypatch.setattr(
@@ -210,13 +212,13 @@ def test_a_regional_shift_has_its_size_and_is_alike_over_its_angle():
     draws = np.stack([regional_field(np.zeros(3), longitude, np.radians(30.0), rng) for _ in range(300)])
     fields = np.swapaxes(draws, 1, 2).reshape(-1, 3)
     # 900 draws: a correlation is known to 0.03; chords of 2 and 30 degrees are 0.067 and 0.989 of the memory.
-    assert np.mean(fields**2) == pytest.approx(1.0, abs=0.12)
+    assert np.mean(fields**2) == approx(1.0, abs=0.12)
     together = np.corrcoef(fields.T)
-    assert together[0, 1] == pytest.approx(np.exp(-0.067), abs=0.06)
-    assert together[0, 2] == pytest.approx(np.exp(-0.989), abs=0.12)
+    assert together[0, 1] == approx(np.exp(-0.067), abs=0.06)
+    assert together[0, 2] == approx(np.exp(-0.989), abs=0.12)
 
 
-@pytest.mark.parametrize("named", [False, True])
+@mark.parametrize("named", [False, True])
 def test_a_scenario_distorts_the_map_that_is_uploaded_by_the_stated_amount(tmp_path, named):
     scenario, craters = load_scenario("selenita"), crater_world()
     plain = loading._catalogue_octets(scenario, craters)
@@ -233,20 +235,20 @@ def test_a_scenario_distorts_the_map_that_is_uploaded_by_the_stated_amount(tmp_p
     first, second = np.argsort(one.ids), np.argsort(other.ids)
     north = other.latitude_rad[second] - one.latitude_rad[first]
     east = np.sin(other.longitude_rad[second] - one.longitude_rad[first]) * np.cos(one.latitude_rad[first])
-    assert MOON_RADIUS_M * np.std(north) == pytest.approx(80.0, rel=0.05)
-    assert MOON_RADIUS_M * np.std(east) == pytest.approx(80.0, rel=0.05)
-    np.testing.assert_array_equal(one.sigma_m[first], other.sigma_m[second])
+    assert MOON_RADIUS_M * np.std(north) == approx(80.0, rel=0.05)
+    assert MOON_RADIUS_M * np.std(east) == approx(80.0, rel=0.05)
+    assert_array_equal(one.sigma_m[first], other.sigma_m[second])
 
 
 def test_slow_errors_wander_with_the_memory_they_are_given():
     elapsed_s = np.full(40_000, 15.0)
     rng = np.random.default_rng(0)
     values = montecarlo._wandering(np.zeros(2), 0.5, 150.0, elapsed_s, rng)[200:]
-    assert np.std(values) == pytest.approx(0.5, rel=0.05)
+    assert np.std(values) == approx(0.5, rel=0.05)
     # Ten steps of 15 s: exp(-1).
-    assert np.mean(values[10:] * values[:-10]) / 0.25 == pytest.approx(np.exp(-1.0), abs=0.05)
+    assert np.mean(values[10:] * values[:-10]) / 0.25 == approx(np.exp(-1.0), abs=0.05)
     still = montecarlo._wandering(np.array([0.3, -0.2]), 0.5, float("inf"), elapsed_s, rng)
-    np.testing.assert_array_equal(still, np.broadcast_to([0.3, -0.2], still.shape))
+    assert_array_equal(still, np.broadcast_to([0.3, -0.2], still.shape))
 
 
 def test_an_acceleration_that_lasts_moves_the_truth_as_it_should(shipped):
@@ -262,7 +264,7 @@ def test_an_acceleration_that_lasts_moves_the_truth_as_it_should(shipped):
     rate = 2.0 * np.pi / 6_672.0
     # Across the plane the orbit is an oscillator: a / n^2 (1 - cos n t).
     expected = acceleration / rate**2 * (1.0 - np.cos(rate * 600.0))
-    assert normal @ (there[k, :3] - here[k, :3]) == pytest.approx(expected, rel=0.12)
+    assert normal @ (there[k, :3] - here[k, :3]) == approx(expected, rel=0.12)
 
 
 def test_every_error_that_the_filter_allows_for_is_drawn(shipped):
@@ -287,7 +289,7 @@ def test_tracks_differ_and_draw_their_nodes_where_they_say():
             altitudes[track] = float(np.linalg.norm(drawn.position_icrf_m)) - 1_737.4e3
         spread = np.ptp(longitudes)
         assert spread > 150.0 if track != "limb" else 75.0 <= min(longitudes) <= max(longitudes) <= 105.0
-    assert inclinations["inclined"] == pytest.approx(60.0, abs=2.0)
-    assert inclinations["limb"] == pytest.approx(80.0, abs=2.0)
-    assert inclinations["test"] == pytest.approx(89.1, abs=2.0)
+    assert inclinations["inclined"] == approx(60.0, abs=2.0)
+    assert inclinations["limb"] == approx(80.0, abs=2.0)
+    assert inclinations["test"] == approx(89.1, abs=2.0)
     assert min(altitudes.values()) > 14e3

@@ -6,7 +6,7 @@ import shutil
 from dataclasses import replace
 
 import numpy as np
-import pytest
+from pytest import approx, fixture, mark, raises
 
 from ground_service.ground import open_ground
 from ground_service.regression.archives import check_archive, keep_archive
@@ -49,14 +49,14 @@ SCENARIO = short_scenario(75.0, "") + "[disturbances]\noutage_at_s = 25.0\noutag
 NO_IMAGE = 2
 
 
-@pytest.fixture(scope="module")
+@fixture(scope="module")
 def archive(tmp_path_factory):
     folder = tmp_path_factory.mktemp("replay") / "pass"
     emulate(parse_scenario(SCENARIO), DataFolder(), folder, frames_kept=None)
     return folder
 
 
-@pytest.fixture
+@fixture
 def copy(archive, tmp_path):
     shutil.copytree(archive, tmp_path / "copy")
     return tmp_path / "copy"
@@ -110,7 +110,7 @@ def test_frames_are_rendered_with_the_data_that_the_archive_declares(copy, tmp_p
     )
     assert complete_archive(copy, tmp_path / "complete", other)["files"].keys() >= {"frames/000000.png"}
     restated(copy, lambda manifest: manifest["data_sources"].append("height model of Mars"))
-    with pytest.raises(RecordError, match=r"^data product missing: height model of Mars$"):
+    with raises(RecordError, match=r"^data product missing: height model of Mars$"):
         complete_archive(copy, tmp_path / "incomplete", other)
 
 
@@ -160,7 +160,7 @@ def test_a_frame_that_the_camera_did_not_give_is_recorded_as_such(archive):
 
 def test_an_archive_without_frames_is_rendered_bit_for_bit(copy, archive, tmp_path):
     (copy / "frames/000003.png").unlink()
-    with pytest.raises(RecordError, match="1 missing, the first 3"):
+    with raises(RecordError, match="1 missing, the first 3"):
         replay_archive(copy, FlightBuild(), tmp_path / "refused")
     manifest = complete_archive(copy, tmp_path / "whole", DataFolder())
     assert (tmp_path / "whole/frames/000003.png").read_bytes() == (archive / "frames/000003.png").read_bytes()
@@ -170,7 +170,7 @@ def test_an_archive_without_frames_is_rendered_bit_for_bit(copy, archive, tmp_pa
 def test_a_scenario_that_renders_something_else_is_refused(copy, tmp_path):
     (copy / "frames/000003.png").unlink()
     restated(copy, lambda m: m.update(scenario_toml=m["scenario_toml"].replace("seed = 7", "seed = 8")))
-    with pytest.raises(RecordError, match="frame 3 rendered from the scenario"):
+    with raises(RecordError, match="frame 3 rendered from the scenario"):
         replay_archive(copy, FlightBuild(), tmp_path / "out", data=DataFolder())
 
 
@@ -178,7 +178,7 @@ def test_an_archive_that_cannot_be_flown_says_why(copy, tmp_path):
     """Another image, detections that are none, samples of a withdrawn instrument, an archive of before."""
 
     def refused(match):
-        with pytest.raises(RecordError, match=match):
+        with raises(RecordError, match=match):
             replay_archive(copy, FlightBuild(), tmp_path / "out")
 
     image, path = copy / "frames/000001.png", copy / "payload/inputs.jsonl"
@@ -227,7 +227,7 @@ def test_a_build_flies_its_own_network(archive):
 def test_a_build_file_of_a_program_is_not_flown_here(tmp_path):
     (tmp_path / "build.toml").write_text('name = "x"\ncommand = ["x", "{archive}", "{out}"]\n')
     assert names_command(tmp_path / "build.toml")
-    with pytest.raises(ParameterError, match="found one with a command"):
+    with raises(ParameterError, match="found one with a command"):
         load_flight_build(tmp_path / "build.toml")
 
 
@@ -263,9 +263,9 @@ flight.anchored.limits.highest_radius_m = 1 -> lowest_radius_m: expected at most
 """
 
 
-@pytest.mark.parametrize(("text", "message"), [line.split(" -> ") for line in BAD.strip().splitlines()])
+@mark.parametrize("text, message", [line.split(" -> ") for line in BAD.strip().splitlines()])
 def test_a_bad_parameter_is_refused_with_its_name(text, message):
-    with pytest.raises(ParameterError) as error:
+    with raises(ParameterError) as error:
         parse_parameters(text, source="p.toml")
     assert message in str(error.value) and str(error.value).startswith(("p.toml: ", "p.toml, "))
 
@@ -322,7 +322,7 @@ filter_degree = 8
 """
 
 
-@pytest.fixture(scope="module")
+@fixture(scope="module")
 def flown(tmp_path_factory):
     """A pass with all its frames, and its images, orbit and attitudes as somebody else would give them."""
     folder = tmp_path_factory.mktemp("flown", numbered=True)
@@ -385,7 +385,7 @@ def test_frames_whose_sun_is_not_that_of_the_ephemeris_are_named_with_both_azimu
     assert [text[9:].split("Z: ")[0] for text in warnings] == ["2029-08-08T02:58:20", "2029-08-08T02:58:40"]
     for text in warnings:
         seen, known = (float(azimuth) for azimuth in re.findall(r"(?:azimuth|at) (\d+) deg", text))
-        assert abs(seen - known) == pytest.approx(180.0, abs=20.0)  # of a few craters
+        assert abs(seen - known) == approx(180.0, abs=20.0)  # of a few craters
     monkeypatch.setattr(emulator, "true_sun_direction", lambda world, position, *_: -position / 1.8e6)
     assert len(sun_warnings(world, detector)) == 3 and "elevation -" in sun_warnings(world, detector)[0]
 
@@ -414,8 +414,8 @@ def test_attitudes_between_two_epochs_lie_on_the_arc_between_them(flown, tmp_pat
     frames = load_external(folder, parse_scenario(TEXT))
     quarter = frames.camera_from_icrf(int(start) + 10_000_000_000)
     # A quarter of forty degrees, whatever the sign of the quaternion.
-    assert np.degrees(np.arccos((np.trace(quarter) - 1.0) / 2.0)) == pytest.approx(10.0, abs=1e-6)
-    assert np.trace(frames.camera_from_icrf(int(start))) == pytest.approx(3.0)
+    assert np.degrees(np.arccos((np.trace(quarter) - 1.0) / 2.0)) == approx(10.0, abs=1e-6)
+    assert np.trace(frames.camera_from_icrf(int(start))) == approx(3.0)
     (folder / "attitude.aem").unlink()
     assert load_external(folder, parse_scenario(TEXT)).camera_from_icrf(int(start)) is None
 
@@ -428,8 +428,8 @@ def edited(name, old, new):
     return edit
 
 
-@pytest.mark.parametrize(
-    ("edit", "words"),
+@mark.parametrize(
+    "edit, words",
     [
         (lambda folder: (folder / "frames.csv").unlink(), "frames.csv: expected a table with columns file and utc"),
         (edited("frames.csv", "file,utc", "name,utc"), "frames.csv, line 2: expected a file and a UTC"),
@@ -467,12 +467,12 @@ def test_frames_outside_the_ephemeris_are_refused(flown, tmp_path):
     (folder / "attitude.aem").unlink()
     edited("frames.csv", "000000.png,2029-08-08T02:58:00", "000000.png,2029-08-08T01:30:00")(folder)
     scenario = parse_scenario(TEXT)
-    with pytest.raises(ScenarioError, match="expected states from 2029-08-08T01:30"):
+    with raises(ScenarioError, match="expected states from 2029-08-08T01:30"):
         emulate(scenario, DataFolder(), tmp_path / "out", external=load_external(folder, scenario))
 
 
-@pytest.mark.parametrize(
-    ("arguments", "words"),
+@mark.parametrize(
+    "arguments, words",
     [
         ([], "expected a scenario or --images DIR"),
         (["selenita", "--evidence", "photographs"], "--evidence: expected together with --images"),

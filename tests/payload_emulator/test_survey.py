@@ -3,7 +3,7 @@
 import json
 
 import numpy as np
-import pytest
+from pytest import approx, fixture, mark, raises
 
 from linna.cli import run
 from lunar.catalogue import make_catalogue
@@ -69,26 +69,26 @@ def test_windows_of_all_seeds_are_counted_together_each_by_its_frames():
     assert figures["frames"] == 20
     assert figures["median_m"] == np.median([10, 20, 30, 40] * 2 + np.linspace(50, 60, 12).tolist())
     # Of three windows drawn again, all are the short ones in 8 of 27 cases, the long one three times in 1 of 27.
-    assert figures["median_95_m"] == pytest.approx([25.0, 55.0])
+    assert figures["median_95_m"] == approx([25.0, 55.0])
     assert figures["max_m"] == 60.0
-    assert figures["nees_mean"] == pytest.approx((6.0 + 8.0 + 12.8) / 3.0)
+    assert figures["nees_mean"] == approx((6.0 + 8.0 + 12.8) / 3.0)
     # Chi-square with 18 degrees of freedom (Abramowitz and Stegun, table 26.8): 8.23075 and 31.5264.
-    assert figures["bounds"] == pytest.approx([8.23075 / 3.0, 31.5264 / 3.0], abs=1e-4)
+    assert figures["bounds"] == approx([8.23075 / 3.0, 31.5264 / 3.0], abs=1e-4)
     # Sigmas are too large by the root of the mean per degree, too small likewise; within the bounds nothing is said.
     assert (figures["nees_remark"], "sigmas" in format_survey(figures)) == ("", False)
     for nees, remark in ((1.5, "sigmas 2.0 times too large"), (24.0, "sigmas 2.0 times too small")):
         assert f"NIS 1.00; {remark}\n" in format_survey(summary([session(*[window(nees=nees)] * 3)]))
-    assert figures["nees_above_12_6_share"] == pytest.approx(1.0 / 3.0)
-    assert figures["nees_trend"] == pytest.approx(8.0 - (6.0 + 12.8) / 2.0)
-    assert figures["bias_rtn_m"] == pytest.approx([(8 * 1 + 12 * 5) / 20, 2.0, (8 * 3 - 12) / 20])
-    assert figures["inside_2_sigma"] == pytest.approx({"r": 0.76, "t": 0.5, "n": 0.6})
-    assert figures["nis"] == pytest.approx((3 + 3 + 2 * 12) / 18)
+    assert figures["nees_above_12_6_share"] == approx(1.0 / 3.0)
+    assert figures["nees_trend"] == approx(8.0 - (6.0 + 12.8) / 2.0)
+    assert figures["bias_rtn_m"] == approx([(8 * 1 + 12 * 5) / 20, 2.0, (8 * 3 - 12) / 20])
+    assert figures["inside_2_sigma"] == approx({"r": 0.76, "t": 0.5, "n": 0.6})
+    assert figures["nis"] == approx((3 + 3 + 2 * 12) / 18)
     assert figures["coast_end_p95_m"] == 100.0
     # Coasts after few frames are counted apart; an axis at 2 sigma is within, and a coast is three axes.
     after = [((2.0, 0.1, -2.1), 37, 900.0), ((0.5, 0.5, -0.5), 59, 300.0), ((9.0, 9.0, 9.0), 60, 50.0)]
     coasts = [window(coast_sigmas=sigmas, coast_frames=n, coast_end_m=end_m) for sigmas, n, end_m in after]
     few, many = summary([session(window(), *coasts)])["coasts"]
-    assert few == {"frames_from": 1, "coasts": 2, "max_m": 900.0, "inside_2_sigma": pytest.approx(5 / 6)}
+    assert few == {"frames_from": 1, "coasts": 2, "max_m": 900.0, "inside_2_sigma": approx(5 / 6)}
     assert many == {"frames_from": 60, "coasts": 1, "max_m": 50.0, "inside_2_sigma": 0.0}
     assert figures["fixed_share"] == 18 / 20
     assert (figures["catalogued_share"], figures["recall_5_30_km"]) == (0.25, 0.75)
@@ -119,11 +119,11 @@ def test_what_is_unknown_has_no_figure_and_a_session_without_settled_windows_is_
     assert {figures[name] for name in ("nis", "nees_trend", "coast_end_p95_m")} == {None}
     text = format_survey(figures)
     assert "not registered" in text and "NIS unknown" in text
-    with pytest.raises(ScenarioError, match="expected windows with more than 20 frames"):
+    with raises(ScenarioError, match="expected windows with more than 20 frames"):
         summary([session()])
 
 
-@pytest.fixture
+@fixture
 def survey_of(tmp_path, monkeypatch, capsys):
     monkeypatch.delenv("LINNA_DATA", raising=False)
     monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path / "none"))
@@ -195,12 +195,12 @@ def test_a_sheet_has_a_place_for_every_picture_and_its_caption():
 def test_a_picture_is_written_whole_or_not_at_all(tmp_path):
     save_png(np.zeros((8, 8, 3), np.uint16), tmp_path / "a.png")
     assert [file.name for file in tmp_path.iterdir()] == ["a.png"]
-    with pytest.raises(OSError):
+    with raises(OSError):
         save_png(np.zeros((8, 8, 3), np.uint8), tmp_path / "missing" / "a.png")
 
 
-@pytest.mark.parametrize(
-    ("error_m", "frames"),
+@mark.parametrize(
+    "error_m, frames",
     [
         ([20_000.0, 300.0, 80.0, 60.0, 50.0, 40.0], 2),
         ([100.0, 90.0, 80.0, 70.0], 1),

@@ -4,7 +4,7 @@ import dataclasses
 from dataclasses import replace
 
 import numpy as np
-import pytest
+from pytest import fixture, mark, raises
 
 from reports.document import Absent, Cell, Picture, Table
 from reports.drawings import picture_files
@@ -28,7 +28,7 @@ from tests.reports import example
 from tests.reports.page import Page
 
 
-@pytest.fixture(scope="module")
+@fixture(scope="module")
 def page(whole_page):
     return Page(whole_page)
 
@@ -186,7 +186,7 @@ def test_a_pass_of_one_frame_is_reported():
     assert "Of 1 expected" in page.text
 
 
-@pytest.mark.parametrize("changes", [(), (("link.coding", "rs", None),)])
+@mark.parametrize("changes", [(), (("link.coding", "rs", None),)])
 def test_settings_are_compared_with_those_of_the_previous_pass(changes):
     _, _, text = of_pass(comparison=SettingsComparison("W-1", changes)).text.rpartition(
         "those of the previous pass, W-1. "
@@ -224,17 +224,17 @@ def test_half_a_downlink_shows_the_share_that_came():
 
 
 def test_arrays_of_different_lengths_and_values_that_are_no_report_are_refused():
-    with pytest.raises(InconsistentReport) as caught:
+    with raises(InconsistentReport) as caught:
         of_pass(navigation=(_series(4, altitude_m=np.zeros(3)),))
     message = str(caught.value)
     assert "'anchored', altitude_m" in message and "(4,)" in message and "(3,)" in message
-    with pytest.raises(InconsistentReport, match="4 labels"):
+    with raises(InconsistentReport, match="4 labels"):
         of_pass(navigation=(_series(4, outcome=("fixed",)),))
-    with pytest.raises(UnknownReportKind, match="dict"):
+    with raises(UnknownReportKind, match="dict"):
         render_html({"title": "not a report"})
 
 
-@pytest.mark.campaign
+@mark.campaign
 def test_a_day_of_passes_stays_under_eight_megabytes():
     report = example.pass_report(hours=24.0)
     assert sum(len(s.utc_ns) for s in report.navigation if s.kind == "estimate") == 3 * 5_760
@@ -341,7 +341,7 @@ def test_what_was_not_made_is_absent_with_its_reason():
     assert not [b for b in empty if isinstance(b, Picture)]
 
 
-@pytest.mark.slow
+@mark.slow
 def test_the_document_is_a_page_and_a_pdf_and_the_same_every_time():
     html, form = render_pages(report())
     assert pdf_of(form, html).startswith(b"%PDF") and "form of the paper" in html.lower()

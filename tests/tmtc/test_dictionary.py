@@ -10,11 +10,11 @@ import zlib
 from pathlib import Path
 
 import numpy as np
-import pytest
 from ccsdspy import FixedLength, PacketArray, PacketField, VariableLength
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose, assert_array_equal
+from pytest import approx, mark, raises
 
 import payload_emulator.flight
 from tmtc.dictionary.arguments import FUNCTION_ARGUMENTS, argument_text, arguments_by_number
@@ -91,8 +91,8 @@ def test_housekeeping_comes_back_within_its_quantisation():
     name, values = DICTIONARY.unpack(pack("housekeeping", HOUSEKEEPING))
     assert name == "housekeeping"
     assert values["mode"] == 2 and values["last_image_quality"] == 1
-    assert values["temperature_c"] == pytest.approx(-12.34, abs=0.005)  # half a step of 0.01
-    assert values["bus_voltage_v"] == pytest.approx(12.017, abs=0.0005)
+    assert values["temperature_c"] == approx(-12.34, abs=0.005)  # half a step of 0.01
+    assert values["bus_voltage_v"] == approx(12.017, abs=0.0005)
     assert values["model_hash"] == 0xDEADBEEF
     assert DICTIONARY.labels("housekeeping", "mode")[values["mode"]] == "observing"
 
@@ -221,7 +221,7 @@ def test_every_telecommand_of_the_dictionary_comes_back_equal(data):
     assert DICTIONARY.pack_command(definition.name, command.values, sequence_count=7) == octets
 
 
-@pytest.mark.parametrize("change, message", [
+@mark.parametrize("change, message", [
     ({"mode": 9}, r"housekeeping\.mode: expected one of 0 \(safe\).*found 9"), ({"mode": "asleep"}, "found 'asleep'"),
     ({"boot_count": 65536}, "expected an integer from 0 to 65535, found 65536"),
     ({"boot_count": 1.5}, "expected an integer"), ({"storage_used_permille": 1001}, "from 0 to 1000, found 1001"),
@@ -229,12 +229,12 @@ def test_every_telecommand_of_the_dictionary_comes_back_equal(data):
     ({"temperature_c": math.nan}, "expected a number from -327.68 to 327.67"),
 ])  # fmt: skip
 def test_values_that_break_the_rules_are_refused_with_field_and_range(change, message):
-    with pytest.raises(ValueRefused, match=message):
+    with raises(ValueRefused, match=message):
         pack("housekeeping", HOUSEKEEPING | change)
 
 
 def test_a_missing_value_is_refused():
-    with pytest.raises(ValueRefused, match=r"housekeeping\.mode: expected a value"):
+    with raises(ValueRefused, match=r"housekeeping\.mode: expected a value"):
         pack("housekeeping", {k: v for k, v in HOUSEKEEPING.items() if k != "mode"})
 
 
@@ -244,16 +244,16 @@ def test_positions_outside_their_range_are_refused_and_more_items_than_fit_too()
         ({"u_px": [-1.0, 5.0]}, r"detections\.u_px"), ({"u_px": [5.0]}, "columns of one length"),
         (many["items"], "at most 255 items"),
     ):  # fmt: skip
-        with pytest.raises(ValueRefused, match=message):
+        with raises(ValueRefused, match=message):
             pack("detections", values | {"items": values["items"] | items})
-    with pytest.raises(ValueRefused, match="expected 2, the number of items"):
+    with raises(ValueRefused, match="expected 2, the number of items"):
         pack("detections", values | {"count": 3})
 
 
 def test_a_number_too_large_for_single_precision_is_refused():
     values = {f.name: [math.nan] * 3 if f.size > 1 else 0 for f in DICTIONARY.packet("navigation_state").fields}
     pack("navigation_state", values | {"velocity_icrf_m_s": [1e38, 0.0, 0.0]})
-    with pytest.raises(ValueRefused):
+    with raises(ValueRefused):
         pack("navigation_state", values | {"velocity_icrf_m_s": [1e39, 0.0, 0.0]})
 
 
@@ -264,7 +264,7 @@ def test_damaged_packets_are_refused_each_for_its_reason():
         (octets[:-1] + bytes((octets[-1] ^ 1,)), ChecksumError, None),
         (DICTIONARY.pack_command("test_connection", {}, sequence_count=0), MalformedPacket, "expected type 0"),
     ):  # fmt: skip
-        with pytest.raises(error, match=message):
+        with raises(error, match=message):
             DICTIONARY.unpack(damaged)
 
 
@@ -281,7 +281,7 @@ def test_packets_of_another_dictionary_are_unknown_and_left_out_of_the_tables():
         (strange, UnknownPacket, "no packet of APID 0x123, service 200, subtype 1"),
         (longer, MalformedPacket, "time_report: expected 31 octets, found 34"),
     ):
-        with pytest.raises(error, match=message):
+        with raises(error, match=message):
             DICTIONARY.unpack(octets)
     buffer = strange + longer + pack("housekeeping", HOUSEKEEPING)
     assert DICTIONARY.identify(buffer, cut_packets(buffer)).tolist() == [-1, WRONG_LENGTH, 0]
@@ -290,7 +290,7 @@ def test_packets_of_another_dictionary_are_unknown_and_left_out_of_the_tables():
 
 def test_a_dictionary_that_defines_a_packet_twice_is_refused():
     definition = PacketDefinition("p", 1, 1, 1, "", (Field("n", "u8", ""),), Group("n", (Field("x", "u8", ""),)))
-    with pytest.raises(MalformedPacket, match="p is defined twice"):
+    with raises(MalformedPacket, match="p is defined twice"):
         Dictionary(1, (definition, definition))
 
 
@@ -307,7 +307,7 @@ def test_a_column_is_made_once_when_it_is_asked_for_and_integers_do_not_wrap():
     assert table.columns["mode"].dtype == np.int64
 
 
-@pytest.mark.parametrize("value", [0, 2**63 - 1, 2**63, 2**64 - 1])
+@mark.parametrize("value", [0, 2**63 - 1, 2**63, 2**64 - 1])
 def test_unsigned_integers_of_64_bits_stay_what_was_sent(value):
     definition = PacketDefinition(
         "wide", 1, 3, 25, "",
@@ -335,16 +335,16 @@ def test_limits_tell_warning_from_alarm_and_a_dictionary_survives_being_written_
     assert again.unpack(pack("connection_report", {}))[0] == "connection_report"
 
 
-@pytest.mark.parametrize("text", ["", "[]", "{}", '{"version": 1, "telemetry": [{}], "telecommands": []}'])
+@mark.parametrize("text", ["", "[]", "{}", '{"version": 1, "telemetry": [{}], "telecommands": []}'])
 def test_something_else_is_refused(text):
-    with pytest.raises(MalformedPacket, match="expected a packet dictionary"):
+    with raises(MalformedPacket, match="expected a packet dictionary"):
         parse_dictionary(text, "old.json")
 
 
 def test_a_changed_definition_is_refused():
     content = json.loads(format_dictionary(DICTIONARY))
     content["telemetry"][0]["fields"][0]["type"] = "u32"
-    with pytest.raises(MalformedPacket, match="expected a dictionary with hash"):
+    with raises(MalformedPacket, match="expected a dictionary with hash"):
         parse_dictionary(json.dumps(content))
 
 
@@ -446,14 +446,14 @@ def test_names_are_entered_in_place_of_numbers():
     assert argument_text("set_parameter", changed) == "parameter temperature high c, value 55 degC"
 
 
-@pytest.mark.parametrize("name, values, expected", [
+@mark.parametrize("name, values, expected", [
     (FUNCTION, {"function_id": "start_observation", "duration_s": -1.0}, "start_observation.duration_s"),
     (FUNCTION, {"function_id": "set_mode", "mode": "asleep"}, r"0 \(safe\)"),
     ("set_parameter", {"parameter_id": "temperature_high_c", "value": 101}, "20 to 100 degC"),
     ("set_parameter", {"parameter_id": 5, "value": 1.5}, "a whole number of 1 to 1000"),
 ])  # fmt: skip
 def test_a_value_outside_its_range_is_refused_with_the_range(name, values, expected):
-    with pytest.raises(ValueRefused, match=expected):
+    with raises(ValueRefused, match=expected):
         arguments_by_number(name, values)
 
 
@@ -510,7 +510,7 @@ def estimates_of(octets):
     return filter_estimates(DICTIONARY.unpack_many(octets, cut_packets(octets)))
 
 
-@pytest.mark.parametrize("name, degrees", [("filter_state", -1), ("filter_estimate", 22)])
+@mark.parametrize("name, degrees", [("filter_state", -1), ("filter_estimate", 22)])
 def test_state_and_covariance_come_back_within_single_precision(name, degrees):
     octets = b"".join(packet(name, row, 100 + row) for row in (0, 1))
     found = estimates_of(octets)
@@ -544,7 +544,7 @@ def test_every_packet_field_and_label_is_in_the_document_and_each_enumeration_is
                 assert seen.setdefault(field.name, field.labels) == field.labels
 
 
-@pytest.mark.parametrize("shape", [(3, 5), (1, 1), (0, 0)])
+@mark.parametrize("shape", [(3, 5), (1, 1), (0, 0)])
 def test_a_thumbnail_reads_back(shape):
     levels = np.arange(shape[0] * shape[1], dtype=np.uint8).reshape(shape)
     octets = pack_thumbnail(Thumbnail(7, 2**40 + 1, levels))
@@ -554,11 +554,11 @@ def test_a_thumbnail_reads_back(shape):
     assert_array_equal(found.levels, levels)
 
 
-@pytest.mark.parametrize(
+@mark.parametrize(
     "octets", [b"", bytes(15), *(HEADER.pack(1, 2, 3, 4) + body for body in (
         b"no zlib", zlib.compress(bytes(11)), zlib.compress(bytes(13)), zlib.compress(bytes(12))[:-5],
     ))],
 )  # fmt: skip
 def test_what_is_no_thumbnail_is_refused(octets):
-    with pytest.raises(ValueRefused, match="thumbnail"):
+    with raises(ValueRefused, match="thumbnail"):
         unpack_thumbnail(octets)

@@ -3,9 +3,9 @@
 import functools
 
 import numpy as np
-import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from pytest import mark, raises
 from spacepackets.ccsds.tm_frame import TmFramePrimaryHeader, TmTransferFrame
 
 from tmtc.dictionary.payload import DICTIONARY
@@ -89,10 +89,10 @@ def cadus(spacecraft_id=76, **options):
     return encode_cadus(sent(), spacecraft_id=spacecraft_id, **options)
 
 
-@pytest.mark.parametrize("randomiser", ["none", "legacy", "long"])
-@pytest.mark.parametrize("coding", ["rs", "none"])
-@pytest.mark.parametrize("checksum", [True, False])
-@pytest.mark.parametrize("frame_length", [223, 892, 1000, 1115])
+@mark.parametrize("randomiser", ["none", "legacy", "long"])
+@mark.parametrize("coding", ["rs", "none"])
+@mark.parametrize("checksum", [True, False])
+@mark.parametrize("frame_length", [223, 892, 1000, 1115])
 def test_what_is_sent_comes_back_and_the_settings_are_found_out(randomiser, coding, checksum, frame_length):
     chosen = {"frame_length": frame_length, "coding": coding, "randomiser": randomiser}
     decoded = read(cadus(**chosen, checksum=checksum))
@@ -101,9 +101,9 @@ def test_what_is_sent_comes_back_and_the_settings_are_found_out(randomiser, codi
     assert {name: getattr(decoded.settings, name) for name in chosen} == chosen
 
 
-@pytest.mark.parametrize("errors", [8, 16])
-@pytest.mark.parametrize("dual_basis", [True, False])
-@pytest.mark.parametrize("interleave", [1, 2, 3, 4, 5, 8])
+@mark.parametrize("errors", [8, 16])
+@mark.parametrize("dual_basis", [True, False])
+@mark.parametrize("interleave", [1, 2, 3, 4, 5, 8])
 def test_every_reed_solomon_setting_is_found_out(errors, dual_basis, interleave):
     frame_length = (255 - 2 * errors - 3) * interleave
     wanted = LinkSettings(
@@ -141,7 +141,7 @@ def test_bare_packets_are_recognised_an_empty_file_is_empty_and_long_packets_spa
     assert packets_of(read(encode_cadus(packets, spacecraft_id=1, frame_length=223))) == packets
 
 
-@pytest.mark.parametrize("spare", range(9))
+@mark.parametrize("spare", range(9))
 def test_the_last_frame_is_filled_exactly_however_little_is_left(spare):
     # zone of 215 octets: the packet leaves 0..8, fewer than the seven of the least idle packet among them
     packet = stranger_of(0x11, 207 - spare)
@@ -183,9 +183,9 @@ def test_each_frame_carries_the_control_word_of_the_last_packet_that_began():
     for frame, word in enumerate(decoded.frames.clcw):
         begun = int(np.count_nonzero(starts < (frame + 1) * (1115 - 6 - 4 - 2))) - 1
         assert int(word).to_bytes(4, "big") == clcws[begun]
-    with pytest.raises(ValueRefused, match="one for each packet"):
+    with raises(ValueRefused, match="one for each packet"):
         encoder.encode(sent(), clcw=clcws[1:])
-    with pytest.raises(ValueRefused, match="4 octets"):
+    with raises(ValueRefused, match="4 octets"):
         encoder.encode(sent()[:1], clcw=b"\x01\x00\x00")
 
 
@@ -295,7 +295,7 @@ def test_unknown_packets_are_counted_given_settings_used_and_markers_without_fra
     assert WITHDRAWN in set(packets_of(decoded))
     noise = np.random.default_rng(3).integers(0, 256, (30, 700), dtype=np.uint8)
     noise[:, :4] = np.frombuffer(ASM, dtype=np.uint8)
-    with pytest.raises(LinkFormatError, match="mostly 700 octets apart"):
+    with raises(LinkFormatError, match="mostly 700 octets apart"):
         read(noise.tobytes())
     wrong = read(cadus(), settings=LinkSettings(randomiser="none", dual_basis=False))
     assert wrong.packets == 0 and wrong.frames_bad == wrong.frame_count
@@ -314,7 +314,7 @@ def test_impossible_settings_are_refused():
         (1, {"frame_length": 2049, "coding": "none"}, ValueRefused, "frame_length"),
         (1, {"frame_length": 1117}, LinkFormatError, "found 1117"),
     ):  # fmt: skip
-        with pytest.raises(error, match=message):
+        with raises(error, match=message):
             cadus(spacecraft_id, **options)
 
 
@@ -388,7 +388,7 @@ def test_headers_are_those_of_the_standard_and_of_spacepackets_and_checksums_hol
     assert frame_checksums_hold(frames).tolist() == [True, True, True, False, True]
 
 
-@pytest.mark.parametrize(
+@mark.parametrize(
     "clcw", [Clcw(0, 0), Clcw(63, 255, True, True, True, True, True, 3, 7), Clcw(5, 17, lockout=True, farm_b_counter=2)]
 )
 def test_command_link_control_words_come_back(clcw):
@@ -399,7 +399,7 @@ def test_control_words_idle_data_and_checksums_are_those_of_the_standard():
     # type 0, version 00, status 000, COP 01 | VC 000101, spare 00 |
     # no RF 0, no lock 0, lockout 1, wait 0, retransmit 1, FARM-B 10, spare 0 | 17
     assert pack_clcw(Clcw(5, 17, lockout=True, retransmit=True, farm_b_counter=2)) == bytes.fromhex("01142C11")
-    with pytest.raises(FrameError):
+    with raises(FrameError):
         unpack_clcw(b"\xff\xff\xff\xff")
     # 1 + D + D^2 + D^22 + D^32: thirty-two ones, then the sum of taps
     data = idle_data(1100)
@@ -412,7 +412,7 @@ def test_control_words_idle_data_and_checksums_are_those_of_the_standard():
 
 
 # ECSS-E-ST-70-41C annex B.1.5 (verification of compliance)
-@pytest.mark.parametrize("row", ["0000 1D0F", "000000 CC9C", "ABCDEF01 04A2", "1456F89A0001 7FD5"])
+@mark.parametrize("row", ["0000 1D0F", "000000 CC9C", "ABCDEF01 04A2", "1456F89A0001 7FD5"])
 def test_the_checksum_agrees_with_the_vectors_of_the_standard(row):
     data, checksum = map(bytes.fromhex, row.split())
     assert crc16(data) == int.from_bytes(checksum, "big")
@@ -422,9 +422,9 @@ def test_a_checksum_leaves_no_remainder_and_a_wrong_one_is_reported_with_both_va
     octets = append_crc(b"any octets")
     assert crc16(octets) == 0
     check_crc(octets, "test")
-    with pytest.raises(ChecksumError, match="expected checksum 0x29B1, found 0x0000"):
+    with raises(ChecksumError, match="expected checksum 0x29B1, found 0x0000"):
         check_crc(b"123456789\0\0", "test")
-    with pytest.raises(TruncatedPacket):
+    with raises(TruncatedPacket):
         check_crc(b"\0", "test")
 
 
@@ -438,7 +438,7 @@ SEQUENCES = {
 }
 
 
-@pytest.mark.parametrize("name", SEQUENCES)
+@mark.parametrize("name", SEQUENCES)
 def test_sequences_begin_as_the_standards_print_them_and_repeat_after_their_full_period_only(name):
     start, bits = SEQUENCES[name]
     assert sequence(name, len(start) // 2).tobytes().hex().upper() == start
@@ -450,14 +450,14 @@ def test_sequences_begin_as_the_standards_print_them_and_repeat_after_their_full
             assert not np.array_equal(stream[: bits - bits // divisor], stream[bits // divisor : bits])
 
 
-@pytest.mark.parametrize("name", ["none", "legacy", "long", "telecommand"])
+@mark.parametrize("name", ["none", "legacy", "long", "telecommand"])
 def test_randomising_twice_gives_the_frames_back(name):
     frames = np.random.default_rng(0).integers(0, 256, (3, 1275), dtype=np.uint8)
     assert np.array_equal(randomise(randomise(frames, name), name), frames)
 
 
 def test_an_unknown_randomiser_is_refused():
-    with pytest.raises(LinkFormatError, match="expected one of none, legacy, long, telecommand, found 'xyz'"):
+    with raises(LinkFormatError, match="expected one of none, legacy, long, telecommand, found 'xyz'"):
         sequence("xyz", 4)
 
 

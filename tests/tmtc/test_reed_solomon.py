@@ -1,8 +1,8 @@
 import numpy as np
-import pytest
 import reedsolo
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from pytest import mark, raises
 
 from tmtc.errors import LinkFormatError
 from tmtc.link.reed_solomon import (
@@ -39,7 +39,7 @@ def test_the_generator_polynomial_and_the_dual_basis_are_those_of_the_standard()
     assert np.array_equal(from_dual[to_dual], np.arange(256))
 
 
-@pytest.mark.parametrize("errors", [8, 16])
+@mark.parametrize("errors", [8, 16])
 def test_conventional_codewords_are_those_of_an_independent_encoder(errors):
     code = ReedSolomon(errors=errors, interleave=1, dual_basis=False)
     frame = frames_for(code, 1)
@@ -62,7 +62,7 @@ def test_dual_codewords_interleaving_and_virtual_fill_are_symbol_by_symbol_those
     assert np.array_equal(encode(frames, short), encode(padded, full)[:, 23:])
 
 
-@pytest.mark.parametrize("row", ["1115 5 1275", "892 4 1020", "223 1 255", "446 2 510", "1784 8 2040", "1000 5 1160"])
+@mark.parametrize("row", ["1115 5 1275", "892 4 1020", "223 1 255", "446 2 510", "1784 8 2040", "1000 5 1160"])
 def test_the_code_is_found_from_the_frame_length(row):
     frame_length, interleave, block_length = map(int, row.split())
     code = code_for(frame_length)
@@ -75,11 +75,11 @@ def test_frames_that_no_code_carries_are_refused():
         (lambda: ReedSolomon(interleave=6), "expected interleave 1, 2, 3, 4, 5 or 8, found 6"),
         (lambda: encode(np.zeros((1, 10), dtype=np.uint8), ReedSolomon()), "expected frames of 1115 octets"),
     ):  # fmt: skip
-        with pytest.raises(LinkFormatError, match=message):
+        with raises(LinkFormatError, match=message):
             refused()
 
 
-@pytest.mark.parametrize("code", [ReedSolomon(), ReedSolomon(8, 2, 5), ReedSolomon(16, 1, 40, False)], ids=str)
+@mark.parametrize("code", [ReedSolomon(), ReedSolomon(8, 2, 5), ReedSolomon(16, 1, 40, False)], ids=str)
 def test_as_many_wrong_symbols_as_promised_are_repaired_and_counted_in_each_codeword(code):
     rng = np.random.default_rng(1)
     frames = frames_for(code, code.errors + 2)
@@ -114,7 +114,7 @@ def test_errors_found_in_the_virtual_fill_mean_that_too_many_others_were_there()
     assert np.array_equal(data, word)
 
 
-@pytest.mark.parametrize("errors", [8, 16])
+@mark.parametrize("errors", [8, 16])
 def test_repair_agrees_with_an_independent_decoder_up_to_and_beyond_its_power(errors):
     theirs = independent(errors)
     code = ReedSolomon(errors=errors, interleave=1, dual_basis=False)

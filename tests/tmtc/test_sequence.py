@@ -1,7 +1,7 @@
 import numpy as np
-import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from pytest import mark
 
 from tmtc.packets.sequence import CONFLICT, DUPLICATE, FIRST, account
 
@@ -99,7 +99,7 @@ def test_a_counter_that_begins_again_is_a_restart_without_hiding_losses():
         assert result.accounts[0].restarts == restarts, (before, after)
 
 
-@pytest.mark.parametrize(
+@mark.parametrize(
     "counts, restarts, conflicts, missing",
     [
         ([*range(25), *range(3, 30)], 1, 0, 0),  # the last five before and the first three after it are lost

@@ -3,9 +3,9 @@
 from itertools import accumulate
 
 import numpy as np
-import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from pytest import mark
 
 from tests.tmtc.test_downlink import make_packets
 from tmtc.dictionary.payload import DICTIONARY
@@ -54,9 +54,7 @@ def test_a_stream_gives_all_its_packets_in_order_also_with_stray_octets():
 # the injuries that other decoders were measured with: 3 stray octets, a flipped bit, a wrong length, a cut end
 
 
-@pytest.mark.parametrize(
-    "stray", [b"\x08\xa1\xc0", b"\x00" * 40, b"\xff" * 40, WHOLE[3:17], b"\x07\xff\xc0\x00\x00\x09"]
-)
+@mark.parametrize("stray", [b"\x08\xa1\xc0", b"\x00" * 40, b"\xff" * 40, WHOLE[3:17], b"\x07\xff\xc0\x00\x00\x09"])
 def test_stray_octets_that_look_like_headers_cost_no_packet(stray):
     octets = inserted(stray)
     cut = cut_to(octets, PACKETS)
@@ -71,7 +69,7 @@ def test_a_flipped_bit_in_a_body_is_one_checksum_error_and_nothing_else():
     assert cut.lengths[~cut.crc_ok].tolist() == [len(PACKETS[500])]
 
 
-@pytest.mark.parametrize("change", [9, -9, 1, 255, 5000, 40_000, SWALLOWED])
+@mark.parametrize("change", [9, -9, 1, 255, 5000, 40_000, SWALLOWED])
 def test_a_wrong_length_field_costs_the_one_packet(change):
     octets, field = bytearray(WHOLE), slice(AT_500 + 4, AT_500 + 6)
     octets[field] = ((int.from_bytes(octets[field], "big") + change) % 65536).to_bytes(2, "big")
@@ -208,7 +206,7 @@ def test_whatever_happens_no_whole_packet_is_lost_and_none_is_invented(injuries)
     assert_every_octet_is_accounted_for(octets, cut)
 
 
-@pytest.mark.parametrize("cases", [1_000, 100_000])
+@mark.parametrize("cases", [1_000, 100_000])
 def test_injured_streams_lose_no_whole_packet_and_invent_none(cases):
     # each case is a segment of its own: two to five packets, of which one to three octets are hit by chance
     rng = np.random.default_rng(2029)

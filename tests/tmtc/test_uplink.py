@@ -1,6 +1,6 @@
-import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from pytest import mark, raises
 
 from tmtc.dictionary.payload import DICTIONARY
 from tmtc.errors import ChecksumError, FrameError, TruncatedPacket, ValueRefused
@@ -51,15 +51,15 @@ def test_damaged_frames_are_refused_each_for_its_reason():
         (frame[:-1] + bytes((frame[-1] ^ 1,)), ChecksumError, None), (frame[:-1], TruncatedPacket, None),
         (b"\xff" * 12, FrameError, None), (bytes(12), FrameError, "8 octets or more"),
     ):  # fmt: skip
-        with pytest.raises(error, match=message):
+        with raises(error, match=message):
             unpack_tc_frame(octets)
-    with pytest.raises(ValueRefused, match=r"1\.\.1017"):
+    with raises(ValueRefused, match=r"1\.\.1017"):
         pack_tc_frame(TcFrame(76, 2, 5, bytes(1018)))
     assert len(pack_tc_frame(TcFrame(76, 2, 5, bytes(1017)))) == 1024
 
 
-@pytest.mark.parametrize("randomised", [True, False])
-@pytest.mark.parametrize("bypass", [True, False])
+@mark.parametrize("randomised", [True, False])
+@mark.parametrize("bypass", [True, False])
 def test_what_is_sent_comes_back_long_packets_too(randomised, bypass):
     octets = UplinkEncoder(76, randomised=randomised, bypass=bypass).encode([*COMMANDS, LONG])
     decoded = UplinkDecoder(76, randomised=randomised).decode(octets)
@@ -171,7 +171,7 @@ def test_any_octets_at_all_are_survived(octets):
     assert decoded.octets_skipped <= 2 * len(octets) + 2
 
 
-@pytest.mark.parametrize(
+@mark.parametrize(
     "data", [b"", b"\x01", b"\x00\x00", CONTROL_SET_COUNT, CONTROL_SET_COUNT + b"\x01\x02", b"\x82\x01\x05"]
 )
 def test_an_invalid_control_command_is_not_counted(data):

@@ -6,7 +6,7 @@ import sys
 from dataclasses import replace
 
 import httpx
-import pytest
+from pytest import mark
 
 from benchmarks.campaigns._clients import Session, cut_pieces
 from benchmarks.campaigns._ledger import FAULTS, AuditLine, Decision, Entered, HandOut, Ledger, judge
@@ -21,7 +21,7 @@ def campaign(monkeypatch, capsys, words):
     return code, json.loads(capsys.readouterr().out)
 
 
-@pytest.mark.campaign
+@mark.campaign
 def test_nothing_is_lost_or_doubled_by_kills_and_a_campaign_goes_on_where_it_ended(monkeypatch, capsys, tmp_path):
     state = tmp_path / "state.json"
     code, figures = campaign(monkeypatch, capsys, f"{SHORT} --kills 3 --state {state}")
@@ -86,8 +86,8 @@ def changed(number, **values):
     return [{**row, **values} if row["id"] == number else row for row in ROWS]
 
 
-@pytest.mark.parametrize(
-    ("fault", "rows"),
+@mark.parametrize(
+    "fault, rows",
     [
         ("commands_lost", ROWS[1:]), ("commands_lost", changed(2, arguments={"argument_1": 99.0})),
         ("commands_doubled", [*ROWS, {**ROWS[3], "id": 5}]), ("states_lost", changed(3, state="queued")),

@@ -1,6 +1,6 @@
 """Hours of new users and the cost of requests: campaigns; here their records and tables."""
 
-import pytest
+from pytest import mark
 
 from benchmarks.campaigns import costs, engineer, operator_http, operator_pages
 from benchmarks.campaigns._strangers import Diary, commands_of
@@ -8,22 +8,22 @@ from ground_service.app import create_app
 from ground_service.settings import Settings
 
 
-@pytest.mark.campaign
+@mark.campaign
 def test_an_operator_comes_from_an_empty_folder_to_a_report_by_http():
     assert operator_http.main() == 0
 
 
-@pytest.mark.campaign
+@mark.campaign
 def test_an_operator_spends_an_hour_with_the_pages():
     assert operator_pages.main() == 0
 
 
-@pytest.mark.campaign
+@mark.campaign
 def test_an_engineer_judges_builds_by_command_line():
     assert engineer.main() == 0
 
 
-@pytest.mark.campaign
+@mark.campaign
 def test_no_request_costs_more_than_the_rule_allows():
     assert costs.main([]) == 0
 
@@ -56,8 +56,8 @@ def test_every_operation_has_a_request_and_every_request_an_operation(tmp_path):
             assert "{" not in costs.derived(path, described, schemas)[1]
 
 
-@pytest.mark.parametrize(
-    ("status", "memory_mib", "processor_s", "kept"),
+@mark.parametrize(
+    "status, memory_mib, processor_s, kept",
     [
         (200, 256.0, 10.0, True), (200, 257.0, 1.0, False), (200, 1.0, 10.1, False), (500, 1.0, 1.0, False),
         (422, 1.0, 1.0, True),

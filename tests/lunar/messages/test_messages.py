@@ -6,11 +6,11 @@ import io
 import zipfile
 
 import numpy as np
-import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from lxml import etree
 from numpy.testing import assert_allclose, assert_array_equal
+from pytest import mark, raises
 from scipy.spatial.transform import Rotation
 
 from lunar.constants import NS
@@ -80,7 +80,7 @@ def test_oem_in_xml_is_read_as_it_was_written():
     assert_same(parse_oem_xml(format_oem_xml(ephemeris()).encode()), ephemeris())
 
 
-@pytest.mark.filterwarnings("ignore:ERFA function")
+@mark.filterwarnings("ignore:ERFA function")
 def test_another_reader_gives_the_same_states_from_xml(tmp_path):
     import oem as independent
 
@@ -95,7 +95,7 @@ def test_another_reader_gives_the_same_states_from_xml(tmp_path):
     assert_allclose(covariances[1].matrix, expected.segments[0].covariances[1].matrix / 1e6)
 
 
-@pytest.mark.filterwarnings("ignore:ERFA function")
+@mark.filterwarnings("ignore:ERFA function")
 def test_oem_of_another_writer_in_xml_is_read(tmp_path):
     import oem as independent
 
@@ -151,7 +151,7 @@ def test_faults_of_xml_are_named_with_their_line():
         ('<?xml version="1.0" encoding="big5"?><oem/>', "expected XML in UTF-8"),
     ):  # fmt: skip
         assert text != whole
-        with pytest.raises(DataFileError, match=message):
+        with raises(DataFileError, match=message):
             parse_oem_xml(text.encode(), "orbit.xml")
 
 
@@ -159,7 +159,7 @@ def test_an_error_in_a_state_names_the_line_of_the_xml():
     lines = format_oem_xml(ephemeris()).splitlines()
     where = next(k for k, line in enumerate(lines) if line.startswith("<stateVector>"))
     lines[where + 1] = lines[where + 1].replace("T00:01", "T00:61")
-    with pytest.raises(DataFileError, match=f"line {where + 2}: expected an epoch"):
+    with raises(DataFileError, match=f"line {where + 2}: expected an epoch"):
         parse_oem_xml("\n".join(lines).encode())
 
 
@@ -174,7 +174,7 @@ def zipped(*contents):
     return buffer.getvalue()
 
 
-@pytest.mark.parametrize("compress", [gzip.compress, zipped])
+@mark.parametrize("compress", [gzip.compress, zipped])
 def test_compressed_oem_is_read(tmp_path, compress):
     path = tmp_path / "orbit"
     for text in (format_oem(ephemeris()), format_oem_xml(ephemeris())):
@@ -188,7 +188,7 @@ def test_two_gzip_members_are_one_file(tmp_path):
     assert read_expanded(path, "text") == b"one two"
 
 
-@pytest.mark.parametrize(
+@mark.parametrize(
     "octets, message",
     [
         (gzip.compress(bytes(5 << 20)), "expected at most 1 MiB when expanded, found more"),
@@ -205,7 +205,7 @@ def test_two_gzip_members_are_one_file(tmp_path):
 def test_faults_of_compressed_files_are_named(tmp_path, octets, message):
     path = tmp_path / "orbit.gz"
     path.write_bytes(octets)
-    with pytest.raises(DataFileError, match=rf"orbit\.gz: {message}"):
+    with raises(DataFileError, match=rf"orbit\.gz: {message}"):
         read_expanded(path, "an ephemeris", 1 << 20)
 
 
@@ -215,9 +215,9 @@ def test_many_gzip_members_take_linear_time(tmp_path):
     assert read_expanded(path, "text") == b""
 
 
-@pytest.mark.parametrize("year", ["9999", "1500"])
+@mark.parametrize("year", ["9999", "1500"])
 def test_years_outside_64_bits_of_nanoseconds_are_refused(year):
-    with pytest.raises(TimeFormatError):
+    with raises(TimeFormatError):
         parse_utc(f"{year}-01-01T00:00:00Z")
 
 
@@ -300,7 +300,7 @@ def test_an_aem_in_xml_is_read_by_its_elements_and_a_missing_scalar_is_named_wit
     (segment,) = parse_aem(AEM_XML)
     assert_array_equal(segment.utc_ns, START + np.array([0, 15]) * NS)
     assert_allclose(segment.q_wxyz, [[0.6, 0, -0.8, 0], [0, 0, 0, -1.0]], atol=1e-15)
-    with pytest.raises(DataFileError, match=r"line 8: expected <QC> with one value, found 'none'"):
+    with raises(DataFileError, match=r"line 8: expected <QC> with one value, found 'none'"):
         parse_aem(AEM_XML.replace("<QC>0.6</QC>", ""))
 
 
@@ -316,16 +316,16 @@ T00:00:15.000  | T00:00:15.000 9 | line 20: expected a quaternion of unit length
 """
 
 
-@pytest.mark.parametrize("old, new, message", rows_of(AEM_FAULTS))
+@mark.parametrize("old, new, message", rows_of(AEM_FAULTS))
 def test_faults_of_an_aem_are_named_with_their_line(old, new, message):
     text, old = format_aem((attitudes(),)), old.replace("¶", "\n")
     assert old in text
-    with pytest.raises(DataFileError, match=message):
+    with raises(DataFileError, match=message):
         parse_aem(text.replace(old, new))
 
 
 def test_an_empty_attitude_segment_is_refused():
-    with pytest.raises(EphemerisError, match="expected at least one attitude, found none"):
+    with raises(EphemerisError, match="expected at least one attitude, found none"):
         AttitudeSegment(np.zeros(0, dtype=np.int64), np.zeros((0, 4)))
 
 
@@ -377,12 +377,12 @@ Calendar Date (TDB) | Date | columns: expected columns with Calendar Date \(TDB\
 """
 
 
-@pytest.mark.parametrize("old, new, message", rows_of(HORIZONS_FAULTS))
+@mark.parametrize("old, new, message", rows_of(HORIZONS_FAULTS))
 def test_faults_of_a_horizons_table_are_named(tmp_path, old, new, message):
     path = tmp_path / "lro.csv"
     assert old in HORIZONS
     path.write_text(HORIZONS.replace(old, new))
-    with pytest.raises(UnknownFrameError if "frame" in message else DataFileError, match=message):
+    with raises(UnknownFrameError if "frame" in message else DataFileError, match=message):
         load_ephemeris(path)
 
 
@@ -400,14 +400,14 @@ def test_a_horizons_table_with_steps_of_a_second_across_a_leap_second_is_read(tm
 def test_an_attitude_within_a_leap_second_is_refused_with_that_reason():
     for system, clock in (("UTC", "2016-12-31T23:59:60.000"), ("TT", "2017-01-01T00:01:08.184")):
         text = format_aem((attitudes(1),)).replace("TIME_SYSTEM = UTC", f"TIME_SYSTEM = {system}")
-        with pytest.raises(DataFileError, match=f"epoch outside of a leap second, .* found '{clock}' {system}"):
+        with raises(DataFileError, match=f"epoch outside of a leap second, .* found '{clock}' {system}"):
             parse_aem(text.replace("2029-08-07T00:00:00.000 ", f"{clock} "))
 
 
 def test_an_spk_is_referred_to_the_converter(tmp_path):
     path = tmp_path / "orbit.bsp"
     path.write_bytes(b"DAF/SPK " + bytes(100))
-    with pytest.raises(DataFileError, match="found a SPICE kernel; convert it with 'linna orbit convert'"):
+    with raises(DataFileError, match="found a SPICE kernel; convert it with 'linna orbit convert'"):
         load_ephemeris(path)
 
 

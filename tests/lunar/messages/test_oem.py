@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from pytest import approx, raises
 
 from lunar.constants import NS
 from lunar.ephemeris import Covariance, Ephemeris, EphemerisSegment
@@ -130,9 +131,9 @@ def test_version_3_is_read_with_time_system_covariances_and_segments():
     assert second.interpolation == "LAGRANGE"
     one, two = first.covariances
     assert (one.frame, two.frame) == ("RTN", "RTN")
-    assert one.matrix[2, 2] == pytest.approx(3.0)  # 3e-6 km2
-    assert one.matrix[4, 0] == one.matrix[0, 4] == pytest.approx(1e-4)
-    assert two.matrix[5, 5] == pytest.approx(4e-6)
+    assert one.matrix[2, 2] == approx(3.0)  # 3e-6 km2
+    assert one.matrix[4, 0] == one.matrix[0, 4] == approx(1e-4)
+    assert two.matrix[5, 5] == approx(4e-6)
     assert np.array_equal(first.velocity_m_s[:, 1], [1665.0, 1662.0])
 
 
@@ -259,7 +260,7 @@ TWICE = VERSION_1 + VERSION_1[VERSION_1.index("META_START") :]
 def test_a_faulty_file_is_refused_in_one_line_with_its_place(tmp_path, text, message):
     path = tmp_path / "faulty.oem"
     path.write_text(text)
-    with pytest.raises(DataFileError) as caught:
+    with raises(DataFileError) as caught:
         load_ephemeris(path)
     found = str(caught.value)
     assert found.startswith(str(path)) and message in found and "\n" not in found
@@ -268,7 +269,7 @@ def test_a_faulty_file_is_refused_in_one_line_with_its_place(tmp_path, text, mes
 def test_a_line_of_more_than_64_kib_is_refused_before_it_is_parsed(tmp_path):
     path = tmp_path / "long.oem"
     path.write_text(replaced("EME2000", "E" * (1 << 17)))
-    with pytest.raises(DataFileError, match=r"expected at most 65536 octets in a line, found more$"):
+    with raises(DataFileError, match=r"expected at most 65536 octets in a line, found more$"):
         load_ephemeris(path)
 
 
@@ -284,7 +285,7 @@ def test_an_unknown_frame_and_an_unknown_time_system_are_refused_with_what_is_kn
         ("= UTC", "= LTC", UnknownTimeSystemError, "11: expected .*TDB"),
     ):
         path.write_text(replaced(old, new))
-        with pytest.raises(error, match=rf"faulty\.oem: line {message}.*, found '{new.strip('= ')}'"):
+        with raises(error, match=rf"faulty\.oem: line {message}.*, found '{new.strip('= ')}'"):
             load_ephemeris(path)
 
 
@@ -317,7 +318,7 @@ def test_epochs_within_a_leap_second_that_have_no_place_are_refused_with_that_re
     text = format_oem(over_the_leap_second(60)).replace(
         "STOP_TIME", "USEABLE_STOP_TIME = 2016-12-31T23:59:60.5\nSTOP_TIME"
     )
-    with pytest.raises(DataFileError, match="line 12: expected a UTC epoch outside of a leap second"):
+    with raises(DataFileError, match="line 12: expected a UTC epoch outside of a leap second"):
         parse_oem(text)
 
 
@@ -332,5 +333,5 @@ def test_an_epoch_that_is_none_among_a_thousand_is_named_with_its_line(fault):
     """Numpy ends the process by a segmentation fault where it refuses one of more than 500 texts."""
     lines = format_oem(over_the_leap_second(1)).splitlines()
     lines[-20] = fault + lines[-20][19:]
-    with pytest.raises(DataFileError, match=f"line {len(lines) - 19}: expected an epoch like .*, found '{fault}"):
+    with raises(DataFileError, match=f"line {len(lines) - 19}: expected an epoch like .*, found '{fault}"):
         parse_oem("\n".join(lines))

@@ -185,7 +185,7 @@ def frames_until_back(run):
     return int(good[0]) + 1 if good.size else 999
 
 
-@mark.parametrize(("distance_m", "announced", "limit"), [(5e3, False, 8), (20e3, True, 4), (20e3, False, 8)])
+@mark.parametrize("distance_m, announced, limit", [(5e3, False, 8), (20e3, True, 4), (20e3, False, 8)])
 def test_a_kidnapped_spacecraft_is_back_within_the_frames_allowed(navigation_case, distance_m, announced, limit):
     case = navigation_case(FRAME + 16, kidnap=Kidnap(FRAME, distance_m, announced), parameters=PARAMETERS)
     for seed in (1, 2):

@@ -412,7 +412,7 @@ def test_a_place_found_without_a_prior_turns_the_orbit_with_it(orbit, monkeypatc
 
 
 @mark.parametrize(
-    ("moved_m", "unseen_s", "velocity_m_s"),
+    "moved_m, unseen_s, velocity_m_s",
     [
         (2_000.0, np.inf, 2.0),  # no fix so far: 1e-3/s of the distance
         (2_000.0, 4_000.0, 2.0),  # the last fix is a coast ago

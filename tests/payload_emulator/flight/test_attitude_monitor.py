@@ -93,7 +93,7 @@ def test_a_sensor_as_declared_or_better_is_left_alone():
             assert not any(one.degraded for one in judged(frames(60, noise, seed)))
 
 
-@mark.parametrize(("noise_deg", "within"), [(0.2, 24), (1.0, 6)])
+@mark.parametrize("noise_deg, within", [(0.2, 24), (1.0, 6)])
 def test_more_noise_is_detected_and_estimated(noise_deg, within):
     for seed in range(10):
         after = judged(frames(60, DECLARED, seed) + frames(40, np.radians(noise_deg), seed + 100))

@@ -83,7 +83,7 @@ def noted(*packets):
 
 
 @mark.parametrize(
-    ("count", "code"),
+    "count, code",
     [
         (100, OUT_OF_SEQUENCE), (99, OUT_OF_SEQUENCE), (101, 0), (8_291, 0), (8_292, OUT_OF_SEQUENCE),
         (16_383, OUT_OF_SEQUENCE)

@@ -77,7 +77,7 @@ def test_turning_the_frame_with_the_sun_turns_the_detections(detector):
 
 
 @mark.parametrize(
-    ("image", "verdict"),
+    "image, verdict",
     [
         (np.zeros((512, 512, 3), np.uint8), ImageQuality.DARK),
         (np.zeros((511, 512, 3), np.uint8), ImageQuality.INVALID),
@@ -322,7 +322,7 @@ def test_enlarging_puts_pixel_x_at_two_x_and_a_half():
 
 
 @mark.parametrize(
-    ("shape", "count"), [((512, 512), 4), ((351, 640), 4), ((200, 300), 2), ((100, 90), 1), ((2000, 3000), 4)]
+    "shape, count", [((512, 512), 4), ((351, 640), 4), ((200, 300), 2), ((100, 90), 1), ((2000, 3000), 4)]
 )
 def test_evidence_comes_from_up_to_four_squares(shape, count):
     squares = _squares(np.zeros(shape, np.float32))
@@ -398,7 +398,7 @@ def test_half_the_exposure_gives_the_same_input():
 
 
 @mark.parametrize(
-    ("image", "verdict"),
+    "image, verdict",
     [
         (np.zeros((512, 512, 3), np.uint8), ImageQuality.DARK),
         (np.full((512, 512, 3), 4, np.uint8), ImageQuality.DARK),

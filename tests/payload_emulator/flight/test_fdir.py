@@ -88,7 +88,7 @@ def test_an_inference_library_that_throws_costs_frames_not_the_payload(observing
 
 
 @mark.parametrize(
-    ("region", "event"), [(MODEL_NUMBER, "model_hash_mismatch"), (PARAMETERS_NUMBER, "parameters_hash_mismatch")]
+    "region, event", [(MODEL_NUMBER, "model_hash_mismatch"), (PARAMETERS_NUMBER, "parameters_hash_mismatch")]
 )
 def test_flipped_bits_in_memory_are_found_reported_and_restored(observing, region, event):
     observing.board.memory[region][1] ^= 0x08
@@ -101,7 +101,7 @@ def test_flipped_bits_in_memory_are_found_reported_and_restored(observing, regio
 
 
 @mark.parametrize(
-    ("table", "event"),
+    "table, event",
     [
         ("catalogue", "catalogue_hash_mismatch"),
         ("anchor_ephemeris", "anchor_table_hash_mismatch"),
@@ -231,7 +231,7 @@ def test_a_clock_that_jumps_ahead_does_not_release_what_it_has_passed(rig):
 
 
 @mark.parametrize(
-    ("heat_c", "drop_v", "event", "safe"),
+    "heat_c, drop_v, event, safe",
     [
         (52.0, 0.0, "temperature_high", False), (90.0, 0.0, "temperature_high", True),
         (-50.0, 0.0, "temperature_low", False), (0.0, 2.3, "power_low", False), (0.0, 3.5, "power_low", True)

@@ -6,6 +6,7 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.random import default_rng
+from numpy.testing import assert_allclose
 from pytest import mark
 
 from lunar.camera import PinholeCamera, project_mcmf
@@ -231,14 +232,14 @@ def test_derivatives_are_those_of_the_projection():
         behind = look(landmarks, INDEX, pose(-change), CAMERA).uv_px
         numeric = (ahead - behind) / (2.0 * step)
         # Central differences: curvature over the step is a part in 1e8 of the largest derivative.
-        np.testing.assert_allclose(numeric, analytic[:, :, k], atol=1e-7 * np.abs(analytic[:, :, k]).max())
+        assert_allclose(numeric, analytic[:, :, k], atol=1e-7 * np.abs(analytic[:, :, k]).max())
 
 
 def test_the_projection_is_that_of_the_camera_of_the_library():
     landmarks = craters()
     seen = look(landmarks, INDEX, pose(np.zeros(11)), CAMERA)
     expected = project_mcmf(CAMERA, NADIR_AT_ORIGIN, POSITION, landmarks.position_mcmf_m)
-    np.testing.assert_allclose(seen.uv_px, expected, atol=1e-9)
+    assert_allclose(seen.uv_px, expected, atol=1e-9)
 
 
 def test_what_is_in_view_is_all_that_projects_into_the_image_and_is_above_the_limb():

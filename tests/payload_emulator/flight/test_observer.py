@@ -5,7 +5,6 @@ from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
-import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 from pytest import approx, fixture, mark
 
@@ -471,7 +470,7 @@ def test_a_sigma_point_filter_in_the_row_of_the_filter_flies_the_demo(tmp_path, 
     assert flown["fixed_share_imaging"] == 1.0 and flown["wrong_fixes"] == 0
     (arc,) = flown["per_arc"]
     assert arc["propagate_only_m"] > 900.0 > 100.0 > arc["max_m"]
-    assert flown["nis_per_degree"] == pytest.approx(0.603, abs=0.005)
+    assert flown["nis_per_degree"] == approx(0.603, abs=0.005)
 
 
 def test_what_was_learned_of_a_catalogue_is_kept_until_another_one_is_loaded():

@@ -291,7 +291,7 @@ def test_an_interpreter_that_is_not_there_is_named(scene):
 
 
 @mark.parametrize(
-    ("body", "message"),
+    "body, message",
     [
         ("sys.exit('out of memory')", "status 1: out of memory"),
         ("pass", r"without writing out\.exr, picture\.png, cost\.json"),

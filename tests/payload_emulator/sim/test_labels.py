@@ -3,6 +3,7 @@
 from math import cos, degrees, hypot, isnan, pi, radians, sin, sqrt
 
 import numpy as np
+from numpy.testing import assert_allclose, assert_array_equal
 from pytest import approx, mark, raises
 
 from lunar.camera import BrownCamera, PinholeCamera, nadir_camera_from_mcmf, pointed_camera_from_mcmf
@@ -114,7 +115,7 @@ def test_craters_cut_by_the_edge_say_so_and_those_out_of_sight_or_behind_the_lim
 def test_frame_labels_point_into_the_terrains_catalogue(procedural):
     labels = label_frame(procedural, CAMERA, *pose(radians(10.0), radians(20.0)))
     assert len(labels) > 10
-    np.testing.assert_array_equal(procedural.catalogue.diameter_m[labels.index], labels.diameter_m)
+    assert_array_equal(procedural.catalogue.diameter_m[labels.index], labels.diameter_m)
     measured = procedural.measured(labels.index)
     assert np.isfinite(measured.rim_height_m).all()
 
@@ -155,11 +156,11 @@ def test_planes_come_back_by_name(tmp_path, options):
     read = read_exr(file)
     assert sorted(read) == sorted(PLANES)
     for name, plane in PLANES.items():
-        np.testing.assert_array_equal(read[name], plane)
+        assert_array_equal(read[name], plane)
 
 
 @mark.parametrize(
-    ("octets", "message"),
+    "octets, message",
     [
         (exr_octets(PLANES)[:-5], "expected 3 lines"), (exr_octets(PLANES, kind=1), "32-bit floats"),
         (exr_octets(PLANES, compression=3), "uncompressed EXR, found method 3"),
@@ -193,8 +194,8 @@ def test_rays_meet_a_smooth_sphere_where_geometry_says(formula_terrain):
     uv = np.array([[255.5, 255.5], [400.25, 30.5], [0.0, 511.0]])
     hits = cast(terrain, CAMERA, position, rotation, uv)
     # Heights are single precision and a ray is halved onto the ground to millimetres.
-    np.testing.assert_allclose(np.linalg.norm(hits, axis=1) - MOON_RADIUS_M, 700.0, atol=0.05)
-    np.testing.assert_allclose(CAMERA.project((hits - position) @ rotation.T), uv, atol=1e-3)
+    assert_allclose(np.linalg.norm(hits, axis=1) - MOON_RADIUS_M, 700.0, atol=0.05)
+    assert_allclose(CAMERA.project((hits - position) @ rotation.T), uv, atol=1e-3)
 
 
 def test_a_label_on_a_slope_sits_on_the_slopes_rim(formula_terrain):

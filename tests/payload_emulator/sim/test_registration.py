@@ -137,7 +137,7 @@ def test_a_product_is_read_as_it_was_written():
 
 
 @mark.parametrize(
-    ("change", "words"),
+    "change, words",
     [
         ({"version": 9}, "expected version 1, found 9"),
         ({"kind": "x"}, "expected a registration made by linna catalogue register"),
@@ -243,7 +243,7 @@ def test_ground_without_a_product_is_registered_from_its_rims(tmp_path):
 
 
 @mark.parametrize(
-    ("changes_list", "message"),
+    "changes_list, message",
     [
         (True, r"registration.json: expected a catalogue with SHA-256 .*make it again"),
         (False, r"flat_128ppd_000E_\+15.tif with SHA-256 .* found another file"),
@@ -378,7 +378,7 @@ def test_files_are_named_in_the_data_folder(tmp_path):
 
 
 @mark.parametrize(
-    ("section", "words"),
+    "section, words",
     [
         ('source = "photograph"', "terrain.photographs must be files where terrain.source is 'photograph'"),
         ('source = "raster"\nphotographs = ["a.tif"]', "terrain.photographs must be files where"),

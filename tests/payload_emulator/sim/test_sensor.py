@@ -66,7 +66,7 @@ def test_the_same_generator_gives_the_same_bits_blur_keeps_light_and_ground_is_s
     assert image[[0, 2]] / image[1] == approx([COLOUR[0], COLOUR[2]], abs=0.01)
 
 
-@mark.parametrize(("bits", "steps", "kind"), [(8, 256, "uint8"), (12, 4096, "uint16"), (16, 65536, "uint16")])
+@mark.parametrize("bits, steps, kind", [(8, 256, "uint8"), (12, 4096, "uint16"), (16, 65536, "uint16")])
 def test_depth_limits_the_number_of_levels_and_the_scene_is_left_as_it_was(bits, steps, kind):
     scene = np.linspace(0.0, 1.0, 128 * 128, dtype=np.float32).reshape(128, 128)
     before = scene.copy()
@@ -130,7 +130,7 @@ def test_hot_and_uneven_pixels_are_the_same_in_every_frame_and_dark_signal_lifts
 
 
 @mark.parametrize(
-    ("options", "message"),
+    "options, message",
     [
         ({"bits": 10}, "8, 12 or 16 bits, found 10"),
         ({"gain": 0.0}, "gain from 0.001 to 1000, found 0"),

@@ -97,7 +97,7 @@ def heights_agree(terrain, latitude, longitude, within_m):
 
 
 @mark.parametrize(
-    ("unit", "offset", "middle_deg"), [("KILOMETER", 1737.4, 180.0), ("KILOMETER", 0, 0.0), ("METER", 1_737_400, 0.0)]
+    "unit, offset, middle_deg", [("KILOMETER", 1737.4, 180.0), ("KILOMETER", 0, 0.0), ("METER", 1_737_400, 0.0)]
 )
 def test_the_unit_of_a_label_holds_without_and_with_an_offset(tmp_path, unit, offset, middle_deg):
     """The labels of SLDEM2015 give OFFSET = 1737.4 and kilometres, and count longitudes from 180 degrees."""
@@ -275,7 +275,7 @@ def test_a_form_of_the_same_ground_gives_the_same_heights(tmp_path, form):
 
 
 @mark.parametrize(
-    ("form", "message"),
+    "form, message",
     [
         ({"convert": lambda h: h / 1e3}, r"differ by 3 m .* found 0\.\d+ .* no unit stated\): kilometres"),
         ({"convert": lambda h: h * 1e3}, r"expected heights of -9200 to 10800 m .* found -\d+ to \d\.\d+e\+06"),
@@ -301,7 +301,7 @@ def test_a_raster_with_another_unit_zero_or_body_is_refused_with_both_numbers(tm
 
 
 @mark.parametrize(
-    ("convert", "message"),
+    "convert, message",
     [
         (lambda h: h, None),
         (lambda h: 2.0 * h, "found 2 times their relief"),
@@ -362,7 +362,7 @@ def test_a_polar_map_holds_the_pole_and_nothing_beyond_its_edge(tmp_path):
 
 
 @mark.parametrize(
-    ("line", "message"),
+    "line, message",
     [
         ('POSITIVE_LONGITUDE_DIRECTION = "WEST"', "expected longitudes to the east, found"),
         ("MAP_PROJECTION_ROTATION = 90.0", "expected MAP_PROJECTION_ROTATION = 0"),

@@ -16,7 +16,7 @@ def test_the_classes_hold_the_papers_counts(procedural):
 
 
 @mark.parametrize("level", [0, 2])
-@mark.parametrize(("row", "column"), [(16, 7), (18, -1)])
+@mark.parametrize("row, column", [(16, 7), (18, -1)])
 def test_neighbouring_tiles_repeat_each_others_edges(procedural, level, row, column):
     columns = 2 * procedural._level_rows[level]
     ppd = procedural._level_rows[level] * 512 / 180.0

@@ -82,7 +82,7 @@ def test_frames_are_taken_at_the_cadence_within_the_latitude_limit(polar_truth):
     assert 6600 / 15 * 2 / 3 - 4 <= times.size <= 6600 / 15 * 2 / 3 + 4
 
 
-@mark.parametrize(("direction", "longitude_deg"), [("ascending", 0.0), ("descending", 180.0)])
+@mark.parametrize("direction, longitude_deg", [("ascending", 0.0), ("descending", 180.0)])
 def test_a_window_runs_across_the_band_in_the_wanted_direction(polar_truth, direction, longitude_deg):
     found = crossings(polar_truth, everywhere, direction=direction)[0]
     assert found.observable
@@ -248,7 +248,7 @@ def test_every_kind_of_fault_is_read(kind):
 
 
 @mark.parametrize(
-    ("text", "message"),
+    "text, message",
     [
         ("camera_dark", "expected KIND at SECONDS"), ("camera_dark at soon for 3", "expected KIND at SECONDS"),
         ("camera_dark at 5", "expected how long it lasts"), ("meteor at 5", "expected one of camera_dark"),

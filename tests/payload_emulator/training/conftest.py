@@ -1,7 +1,7 @@
 """Crude data sets for the tests: bright-and-dark blobs on a plain, drawn without any renderer."""
 
 import numpy as np
-import pytest
+from pytest import fixture
 
 from payload_emulator.session.world.recipe import Recipe, Source
 from payload_emulator.training.data import dataset as store
@@ -91,11 +91,11 @@ def write_blob_dataset(folder, frames_per_split, seed=3, pits=()):
     return store.Dataset(folder)
 
 
-@pytest.fixture(scope="session")
+@fixture(scope="session")
 def blob_dataset(tmp_path_factory):
     return write_blob_dataset(tmp_path_factory.mktemp("blobs") / "set", {"train": 24, "val": 6, "test": 4})
 
 
-@pytest.fixture(scope="session")
+@fixture(scope="session")
 def make_blob_dataset():
     return write_blob_dataset

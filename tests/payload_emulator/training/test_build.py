@@ -12,7 +12,8 @@ import time
 from pathlib import Path
 
 import numpy as np
-import pytest
+from numpy.testing import assert_allclose, assert_array_equal
+from pytest import fixture, mark, raises
 
 from lunar.boxes import Box
 from lunar.camera import PinholeCamera
@@ -74,7 +75,7 @@ def empty_set(folder):
     return folder
 
 
-@pytest.fixture(scope="module")
+@fixture(scope="module")
 def built(tmp_path_factory):
     folder = tmp_path_factory.mktemp("built") / "set"
     list(made(folder))
@@ -130,7 +131,7 @@ def test_a_full_disk_loses_nothing_that_was_finished(tmp_path):
     try:
         # A picture has more than a hundred thousand octets.
         resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, limits[1]))
-        with pytest.raises(DatasetError, match=r"File too large.*; 1 of 4 frames are kept, the same command goes on"):
+        with raises(DatasetError, match=r"File too large.*; 1 of 4 frames are kept, the same command goes on"):
             list(steps)
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
@@ -140,14 +141,14 @@ def test_a_full_disk_loses_nothing_that_was_finished(tmp_path):
 
 def test_a_dead_worker_is_said_in_one_line(tmp_path, monkeypatch):
     monkeypatch.setattr("payload_emulator.training.data.build._follow_parent", functools.partial(os._exit, 9))
-    with pytest.raises(DatasetError, match=r"a worker process died .*; 0 of 4 frames are kept"):
+    with raises(DatasetError, match=r"a worker process died .*; 0 of 4 frames are kept"):
         list(made(tmp_path / "set", 2))
 
 
 def test_two_builds_do_not_write_to_one_folder(tmp_path):
     steps = made(tmp_path / "set")
     assert next(steps) == (0, 4)
-    with pytest.raises(DatasetError, match="found a build in progress"):
+    with raises(DatasetError, match="found a build in progress"):
         next(made(tmp_path / "set"))
     steps.close()
     assert next(made(tmp_path / "set")) == (0, 4)
@@ -179,7 +180,7 @@ def test_metadata_tell_pose_corners_and_sun(built):
     for key in ("latitude_deg", "longitude_deg", "altitude_km", "tilt_deg", "azimuth_deg", "corners_deg"):
         assert key in document
     rotation = np.array(document["camera_from_mcmf"])
-    np.testing.assert_allclose(rotation @ document["sun_mcmf"], document["sun_camera"], atol=1e-12)
+    assert_allclose(rotation @ document["sun_mcmf"], document["sun_camera"], atol=1e-12)
     assert len(document["corners_deg"]) == 4
 
 
@@ -200,25 +201,25 @@ def test_ellipses_of_coco_lie_in_their_boxes(built):
         whole += 1
         box = [x.min(), y.min(), np.ptp(x), np.ptp(y)]
         # Rounded to a hundredth of a pixel and of a degree, and looked at every two degrees.
-        np.testing.assert_allclose(box, a["bbox"], atol=0.03 + 2e-4 * half_major)
+        assert_allclose(box, a["bbox"], atol=0.03 + 2e-4 * half_major)
     assert whole >= 10
 
 
 def test_another_data_set_in_the_folder_is_refused(built):
-    with pytest.raises(DatasetError, match="expected an empty folder or the same data set"):
+    with raises(DatasetError, match="expected an empty folder or the same data set"):
         list(made(built, seed=8))
 
 
 def test_other_files_in_the_folder_are_left_alone(tmp_path):
     (tmp_path / "letter.txt").write_text("mine")
-    with pytest.raises(DatasetError, match="found other files"):
+    with raises(DatasetError, match="found other files"):
         list(made(tmp_path))
     assert (tmp_path / "letter.txt").read_text() == "mine"
 
 
 def test_real_terrain_without_data_is_refused(tmp_path):
     recipe = load_recipe(ROOT / "scenarios" / "detector-dataset.toml")
-    with pytest.raises(DatasetError, match="expected terrain tiles"):
+    with raises(DatasetError, match="expected terrain tiles"):
         list(build(recipe, tmp_path / "set", 40, find_data(None)))
 
 
@@ -240,7 +241,7 @@ def test_labels_of_fresh_craters_sit_on_dark_and_bright_walls(built):
     assert np.mean(np.array(contrast) > 0) > 0.85
 
 
-@pytest.mark.real_data
+@mark.real_data
 def test_training_frames_keep_sixty_kilometres_from_every_held_out_box(tmp_path, data_path):
     recipe = load_recipe(ROOT / "scenarios" / "detector-dataset.toml")
     empty_set(tmp_path)
@@ -268,15 +269,15 @@ def test_the_renderers_of_a_recipe_get_the_same_scenes_and_an_unknown_one_is_ref
         make_shard(dataclasses.replace(RECIPE, renderer=name), shard, folder, "")
         frames[name] = store.load_shard(folder / "shards" / f"{shard.name}.npz")
     fast, slow = frames["fast"], frames["raymarch"]
-    np.testing.assert_array_equal(fast.position_mcmf_m, slow.position_mcmf_m)
-    np.testing.assert_array_equal(fast.sun_camera, slow.sun_camera)
+    assert_array_equal(fast.position_mcmf_m, slow.position_mcmf_m)
+    assert_array_equal(fast.sun_camera, slow.sun_camera)
     assert fast.image_sha256 != slow.image_sha256
-    with pytest.raises(ScenarioError, match="expected one of fast, raymarch, cycles, found 'pov'"):
+    with raises(ScenarioError, match="expected one of fast, raymarch, cycles, found 'pov'"):
         list(made(tmp_path / "x", renderer="pov"))
 
 
 def test_a_build_by_cycles_without_blender_says_what_is_missing(tmp_path):
-    with pytest.raises(RendererError, match="expected a Python interpreter with Blender"):
+    with raises(RendererError, match="expected a Python interpreter with Blender"):
         list(made(tmp_path / "x", 1, str(tmp_path / "none"), renderer="cycles"))
 
 
@@ -304,7 +305,7 @@ class Everywhere:
         return int(sample_m > 200.0)
 
 
-@pytest.fixture(scope="module")
+@fixture(scope="module")
 def polar_orbit(tmp_path_factory):
     """One revolution over the poles, a state every 30 s."""
     time_s = np.arange(0.0, PERIOD_S, 30.0)
@@ -335,7 +336,7 @@ def test_every_position_within_sixty_degrees_is_taken_and_no_other(polar_orbit):
     assert np.abs(np.degrees(latitude)).max() <= 60.0
     assert np.allclose(altitude, 30_000.0, atol=5.0)
     # Two thirds of a polar revolution of 110 minutes at two frames a minute: 147.
-    with pytest.raises(DatasetError, match=r"expected 200 places .* found 14\d of 2\d\d"):
+    with raises(DatasetError, match=r"expected 200 places .* found 14\d of 2\d\d"):
         laid(source(polar_orbit), 200)
     steps = np.diff(track.utc_ns) / 1e9
     assert set(np.round(steps[steps < 60.0], 6)) == {30.0}
@@ -346,8 +347,8 @@ def test_every_position_within_sixty_degrees_is_taken_and_no_other(polar_orbit):
 def test_places_follow_the_ephemeris_and_not_its_step_within_boxes_and_buffers(polar_orbit):
     fine = laid(source(polar_orbit, step_s=15.0), 40)
     coarse = laid(source(polar_orbit), 20)
-    np.testing.assert_array_equal(fine.utc_ns[::2], coarse.utc_ns)
-    np.testing.assert_allclose(fine.position_mcmf_m[::2], coarse.position_mcmf_m, atol=1e-3)
+    assert_array_equal(fine.utc_ns[::2], coarse.utc_ns)
+    assert_allclose(fine.position_mcmf_m[::2], coarse.position_mcmf_m, atol=1e-3)
     north = source(polar_orbit, boxes=(Box(0.0, 360.0, 10.0, 60.0),), avoid=(Box(0.0, 360.0, 40.0, 50.0),))
     track = laid(north, 20)
     latitude = np.degrees(spherical_from_mcmf(track.position_mcmf_m)[0])
@@ -372,7 +373,7 @@ def test_an_ephemeris_below_the_ground_is_refused_with_the_place(polar_orbit):
     position = laid(along, 1).position_mcmf_m[0]
     rng = np.random.default_rng(1)
     assert pose_at(Everywhere(), CAMERA, along, position, "frame 3", rng).ground_m == 0.0
-    with pytest.raises(DatasetError, match=r"frame 3: expected a place above the ground at .* found the camera at"):
+    with raises(DatasetError, match=r"frame 3: expected a place above the ground at .* found the camera at"):
         pose_at(Everywhere(31_000.0), CAMERA, along, position, "frame 3", rng)
 
 
@@ -400,7 +401,7 @@ share = 1.0
         (text.replace("16", "12").replace("80/15/5", "train"), "bits: expected one of 8, 16, found 12"),
     ):
         path.write_text(wrong)
-        with pytest.raises(DatasetError, match=message):
+        with raises(DatasetError, match=message):
             load_recipe(path)
 
 

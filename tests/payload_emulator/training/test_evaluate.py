@@ -4,9 +4,9 @@ import json
 from dataclasses import replace
 
 import numpy as np
-import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from pytest import approx, fixture, mark, raises
 
 from payload_emulator.errors import DatasetError, ModelError
 from payload_emulator.flight.models import load_shipped_model
@@ -53,12 +53,12 @@ from reports.render import render_html
 from tests.payload_emulator.training.conftest import found_at, truth_of
 
 
-@pytest.fixture(scope="module")
+@fixture(scope="module")
 def detector():
     return open_for_evaluation(load_shipped_model())
 
 
-@pytest.fixture(scope="module")
+@fixture(scope="module")
 def scored(detector, blob_dataset):
     return run(detector, [blob_dataset], "test")
 
@@ -88,23 +88,23 @@ def test_the_report_shows_the_worst_frames_and_says_what_it_lacks(detector, blob
 
 
 def test_a_split_without_frames_is_refused(detector, blob_dataset):
-    with pytest.raises(DatasetError, match=r"expected frames of split 'test', source 'none', found none"):
+    with raises(DatasetError, match=r"expected frames of split 'test', source 'none', found none"):
         run(detector, [blob_dataset], "test", "none")
 
 
 def test_frames_of_another_camera_or_field_of_view_are_refused(detector, make_blob_dataset, tmp_path, monkeypatch):
     other = make_blob_dataset(tmp_path / "set", {"test": 1})
     monkeypatch.setitem(detector.metadata, "camera_fov_deg", "90")
-    with pytest.raises(DatasetError, match=r"90 degrees\), found 512 x 512 pixels, 120 degrees"):
+    with raises(DatasetError, match=r"90 degrees\), found 512 x 512 pixels, 120 degrees"):
         run(detector, [other], "test")
     monkeypatch.undo()
     other.index["camera"]["width_px"] = 640
-    with pytest.raises(DatasetError, match=r"expected frames of the detector's camera \(512 x 512"):
+    with raises(DatasetError, match=r"expected frames of the detector's camera \(512 x 512"):
         run(detector, [other], "test")
 
 
 def test_the_papers_variant_needs_the_papers_heatmaps(detector, blob_dataset):
-    with pytest.raises(ModelError, match="three class heatmaps, found 0"):
+    with raises(ModelError, match="three class heatmaps, found 0"):
         detect_by_class(detector, blob_dataset, blob_dataset.frames("test")[0])
 
 
@@ -132,7 +132,7 @@ def test_real_terrain_that_fixed_thresholds_or_weights_counts_as_seen(blob_datas
 ONE_STEP = TrainParameters(minutes=0.0, steps=1, batch=2, crop_px=96, validation_frames=1, replicas=1, detail_blocks=0)
 
 
-@pytest.fixture(scope="module")
+@fixture(scope="module")
 def exported(blob_dataset, tmp_path_factory):
     run = tmp_path_factory.mktemp("export")
     train([blob_dataset], run, ONE_STEP)
@@ -164,14 +164,14 @@ def test_the_papers_variant_keeps_its_class_heatmaps_and_is_scored_by_them(expor
 
 def test_a_network_without_class_heatmaps_is_no_papers_variant(blob_dataset, tmp_path):
     train([blob_dataset], tmp_path, replace(ONE_STEP, paper_classes=False, depth=False))
-    with pytest.raises(ModelError, match="expected a network with the paper's class heatmaps"):
+    with raises(ModelError, match="expected a network with the paper's class heatmaps"):
         export(tmp_path / "checkpoint.pt", tmp_path / "p.onnx", [], paper_classes=True)
 
 
 HEADER = "latitude_deg,longitude_deg,height_m,diameter_m,sightings,looks,score\n"
 
 
-@pytest.fixture
+@fixture
 def landmarks(tmp_path):
     # 30 km over latitude and longitude 0: 203 m to the pixel, u to the east, v to the south, 30,323 m to the degree.
     place = f"{(255.5 - 150.0) * 203.0 / 30_323:.6f},{(200.0 - 255.5) * 203.0 / 30_323:.6f}"
@@ -185,9 +185,9 @@ def test_landmarks_become_labels_where_they_are_in_view(blob_dataset, landmarks)
     bare = replace(frame, craters={key: values[:0] for key, values in frame.craters.items()})
     taught = with_landmarks(blob_dataset, bare, landmarks)
     # 21 and 11 km from the point below, the ground lies 167 m lower: 0.6 % closer to the middle.
-    assert taught.craters["u_px"][-1] == pytest.approx(255.5 - 55.5 * 0.9944, abs=0.05)
-    assert taught.craters["v_px"][-1] == pytest.approx(255.5 - 105.5 * 0.9944, abs=0.05)
-    assert taught.craters["diameter_px"][-1] == pytest.approx(40.0, rel=0.02)
+    assert taught.craters["u_px"][-1] == approx(255.5 - 55.5 * 0.9944, abs=0.05)
+    assert taught.craters["v_px"][-1] == approx(255.5 - 105.5 * 0.9944, abs=0.05)
+    assert taught.craters["diameter_px"][-1] == approx(40.0, rel=0.02)
     assert taught.craters["id"][-1] > 1_000_000_000
     assert bare.craters["u_px"].size == 0
     away = replace(bare, position_mcmf_m=bare.position_mcmf_m + np.array([0.0, 90_000.0, 0.0]))
@@ -197,7 +197,7 @@ def test_landmarks_become_labels_where_they_are_in_view(blob_dataset, landmarks)
 def test_a_file_that_holds_no_landmarks_is_refused(tmp_path):
     path = tmp_path / "l.csv"
     path.write_text("a,b\n1,2\n")
-    with pytest.raises(DatasetError, match="expected landmarks"):
+    with raises(DatasetError, match="expected landmarks"):
         load_landmarks(path)
 
 
@@ -214,8 +214,8 @@ def bias_of(*scenes):
     return octants, bias_overall(tallied, 0.5, truths, octants)
 
 
-@pytest.mark.parametrize(
-    ("azimuth_deg", "shift"),
+@mark.parametrize(
+    "azimuth_deg, shift",
     # Toward a Sun at the top, right, bottom, left: up, right, down, left in an image whose v grows downward.
     [(1.0, (0.0, -0.5)), (91.0, (0.5, 0.0)), (181.0, (0.0, 0.5)), (271.0, (-0.5, 0.0))],
 )
@@ -223,20 +223,20 @@ def test_a_pull_toward_the_sun_is_reported_as_such_wherever_the_sun_is(azimuth_d
     octants, overall = bias_of(shifted_scene(azimuth_deg, shift))
     row = octants[int(azimuth_deg // 45)]
     assert row["pairs"] == overall["pairs"] == 25
-    assert (row["du_px"], row["dv_px"]) == pytest.approx(shift)
+    assert (row["du_px"], row["dv_px"]) == approx(shift)
     # The Sun is one degree past the axis: 0.5 cos 1 and 0.5 sin 1.
-    assert row["toward_sun_px"] == pytest.approx(0.49992, abs=1e-5)
-    assert row["across_sun_px"] == pytest.approx(-0.00873, abs=1e-5)
-    assert row["length_px"] == overall["worst_octant_px"] == pytest.approx(0.5)
+    assert row["toward_sun_px"] == approx(0.49992, abs=1e-5)
+    assert row["across_sun_px"] == approx(-0.00873, abs=1e-5)
+    assert row["length_px"] == overall["worst_octant_px"] == approx(0.5)
 
 
 def test_pulls_that_cancel_over_all_suns_remain_in_their_octants():
     octants, overall = bias_of(shifted_scene(10.0, (0.3, 0.0)), shifted_scene(190.0, (-0.3, 0.0), 1))
-    assert overall["length_px"] == pytest.approx(0.0, abs=1e-12)
-    assert overall["worst_octant_px"] == pytest.approx(0.3)
+    assert overall["length_px"] == approx(0.0, abs=1e-12)
+    assert overall["worst_octant_px"] == approx(0.3)
     # Frames pull in opposite directions: resampling two frames gives anything from -0.3 to 0.3.
-    assert overall["interval_95"]["du_px"] == pytest.approx([-0.3, 0.3])
-    assert octants[0]["interval_95"]["du_px"] == pytest.approx([0.3, 0.3])
+    assert overall["interval_95"]["du_px"] == approx([-0.3, 0.3])
+    assert octants[0]["interval_95"]["du_px"] == approx([0.3, 0.3])
     assert octants[2]["pairs"] == 0 and np.isnan(octants[2]["du_px"])
 
 
@@ -269,21 +269,21 @@ def frames(count=12, share=SHARE, depth_said=True, noise=0.0, seed=0):
 
 def test_the_share_put_in_is_the_share_found():
     share, error = fit_parallax(frames())
-    assert share == pytest.approx(SHARE, rel=1e-6) and error < 1e-9
+    assert share == approx(SHARE, rel=1e-6) and error < 1e-9
 
 
 def test_the_standard_error_covers_the_scatter_of_the_fit():
     fits = np.array([fit_parallax(frames(noise=0.5, seed=seed)) for seed in range(12)])
     assert np.abs(fits[:, 0].mean() - SHARE) < 3 * fits[:, 1].mean() / np.sqrt(12)
     # Twelve fits know their spread to a factor of about 1.5.
-    assert fits[:, 0].std() == pytest.approx(fits[:, 1].mean(), rel=0.6)
+    assert fits[:, 0].std() == approx(fits[:, 1].mean(), rel=0.6)
 
 
 def test_detections_come_back_onto_the_rims():
     for truth, found in frames(2):
         put_right = without_parallax(found, SHARE, truth)
-        assert put_right.u_px == pytest.approx(truth.u_px, abs=1e-6)
-        assert put_right.v_px == pytest.approx(truth.v_px, abs=1e-6)
+        assert put_right.u_px == approx(truth.u_px, abs=1e-6)
+        assert put_right.v_px == approx(truth.v_px, abs=1e-6)
 
 
 def test_a_network_that_tells_no_depth_is_corrected_on_the_whole():
@@ -342,7 +342,7 @@ def test_a_common_shift_is_the_bias_of_its_sun_octant():
     figures = figures_of([part], [LOW])
     biased = [row for row in figures["bias_px_by_sun_octant"] if row["pairs"]]
     assert [row["octant"] for row in biased] == [2]
-    assert (biased[0]["du_px"], biased[0]["dv_px"]) == pytest.approx((0.4, -0.2))
+    assert (biased[0]["du_px"], biased[0]["dv_px"]) == approx((0.4, -0.2))
 
 
 def test_sigma_is_called_calibrated_where_errors_follow_it():
@@ -355,7 +355,7 @@ def test_sigma_is_called_calibrated_where_errors_follow_it():
         parts.append((truth, replace(found, u_px=found.u_px + error_u, v_px=found.v_px + error_v)))
     calibration = figures_of(parts, [LOW] * 40)["sigma_calibration"]
     # 80 draws: the rms of a unit Gaussian is known to 1 / sqrt(160) = 0.08.
-    assert calibration["rms"] == pytest.approx(1.0, abs=0.25)
+    assert calibration["rms"] == approx(1.0, abs=0.25)
     assert calibration["by_altitude_km"][0]["pairs"] == 40
 
 
@@ -364,7 +364,7 @@ def test_states_said_are_counted_against_the_terrains_own():
     wrong = scene([100], [100], depth=0.15, said=0.03)
     state = figures_of([fresh, wrong], [LOW, LOW])["degradation_state"]
     assert state["confusion"] == [[0, 0, 0], [0, 0, 0], [1, 0, 2]]
-    assert state["agreement"] == pytest.approx(2 / 3)
+    assert state["agreement"] == approx(2 / 3)
 
 
 def test_thresholds_of_three_purposes_are_scored_side_by_side():
@@ -384,7 +384,7 @@ def test_average_precision_of_a_ranking_done_by_hand():
     # Ranked right, wrong, right over 2 craters: areas 0.5 * 1 + 0.5 * 2/3.
     truth, _ = scene([100, 200], [100, 200])
     found = found_at([100, 400, 200], [100, 400, 200], scores=[0.9, 0.8, 0.7])
-    assert average_precision(tally([truth], [found])) == pytest.approx(0.5 + 0.5 * 2 / 3)
+    assert average_precision(tally([truth], [found])) == approx(0.5 + 0.5 * 2 / 3)
 
 
 def truth(u, v, depth_ratio=0.15, **more):
@@ -403,7 +403,7 @@ def test_two_detections_of_one_crater_are_one_right_and_one_false():
 def test_the_better_detection_takes_the_crater():
     tallied = tally([truth([100], [100])], [found([105, 100], [100, 100], [0.9, 0.8])])
     assert tallied.figures(0.85).detected_true == 1
-    assert tallied.error_u[tallied.outcome == 1] == pytest.approx([5.0])
+    assert tallied.error_u[tallied.outcome == 1] == approx([5.0])
 
 
 def test_precision_recall_and_f1_of_a_case_counted_by_hand():
@@ -411,10 +411,10 @@ def test_precision_recall_and_f1_of_a_case_counted_by_hand():
     figures = tally(
         [truth([50, 150, 250, 350], [50, 50, 50, 50])], [found([52, 150, 450], [50, 53, 450], [0.9, 0.8, 0.7])]
     ).figures(0.5)
-    assert figures.precision == pytest.approx(2 / 3)
-    assert figures.recall == pytest.approx(0.5)
-    assert figures.f1 == pytest.approx(4 / 7)
-    assert figures.loc_px == pytest.approx(2.5)
+    assert figures.precision == approx(2 / 3)
+    assert figures.recall == approx(0.5)
+    assert figures.f1 == approx(4 / 7)
+    assert figures.loc_px == approx(2.5)
 
 
 def test_the_pixel_rule_ends_at_ten_pixels_and_the_radius_rule_at_half_a_radius():
@@ -464,7 +464,7 @@ def test_the_best_threshold_separates_right_from_wrong():
 def test_the_bootstrap_interval_holds_the_figure_and_narrows_to_it_when_blocks_agree():
     frames = [truth([100, 200], [100, 200], number=k) for k in range(8)]
     detections = [found([100], [100], [0.9])] * 8
-    assert with_interval(tally(frames, detections), 0.5)["f1_interval_95"] == pytest.approx([2 / 3, 2 / 3])
+    assert with_interval(tally(frames, detections), 0.5)["f1_interval_95"] == approx([2 / 3, 2 / 3])
 
 
 points = st.lists(st.tuples(st.floats(0, 100), st.floats(0, 100)), max_size=12)
@@ -512,16 +512,16 @@ def scored_frames(count=150, seed=1):
 
 def test_the_odds_put_in_are_the_odds_found():
     model = fit_score(*scored_frames())
-    assert model.slope == pytest.approx(2.0, rel=0.1)
+    assert model.slope == approx(2.0, rel=0.1)
     offset = np.interp(np.log([14.0, 20.0, 40.0]), model.log_diameter_px, model.offset)
     # Some 10,000 detections: the standard error of an offset is about 0.08.
-    assert offset == pytest.approx(1.0 - np.log(np.array([14.0, 20.0, 40.0]) / 20.0), abs=0.3)
+    assert offset == approx(1.0 - np.log(np.array([14.0, 20.0, 40.0]) / 20.0), abs=0.3)
     half = model.probability(np.array([0.5]), np.array([20.0]))[0]
-    assert half == pytest.approx(np.e / (1.0 + np.e), abs=0.05)
+    assert half == approx(np.e / (1.0 + np.e), abs=0.05)
 
 
 def test_too_few_detections_are_refused():
-    with pytest.raises(DatasetError, match="expected at least 200 detections"):
+    with raises(DatasetError, match="expected at least 200 detections"):
         fit_score(*scored_frames(2))
 
 
@@ -553,11 +553,11 @@ def pairs(pull=(0.3, 0.2, 0.4), ground_m=((60.0, -30.0), (-20.0, 10.0)), lasting
 
 def test_pull_and_registration_are_separated():
     residual, evidence = fit_sun(pairs())
-    assert tuple(evidence["coefficients_px"]) == pytest.approx((0.3, 0.2, 0.4), abs=0.08)
+    assert tuple(evidence["coefficients_px"]) == approx((0.3, 0.2, 0.4), abs=0.08)
     assert max(evidence["standard_errors_px"]) < 0.05
     for row, (east, north) in zip(evidence["registration"], ((60.0, -30.0), (-20.0, 10.0)), strict=True):
-        assert row["east_m"] == pytest.approx(east, abs=8.0)
-        assert row["north_m"] == pytest.approx(north, abs=8.0)
+        assert row["east_m"] == approx(east, abs=8.0)
+        assert row["north_m"] == approx(north, abs=8.0)
         assert row["standard_error_m"] < 6.0
     assert np.abs(residual.mean(axis=0)).max() < 0.05
 
@@ -571,21 +571,21 @@ def test_lasting_and_fresh_errors_are_separated():
     for size in (-0.5, 0.0, 0.8):
         total, fresh = model.variances_px2(np.array([[1.0, size, np.log(1.5), 1.0, 1.7, 0.5]]))
         lasting = 1.2 * np.exp(size)
-        assert np.sqrt(fresh[0]) == pytest.approx(FRESH_FACTOR * 0.4, rel=0.1)
-        assert np.sqrt(total[0]) == pytest.approx(np.hypot(0.4, lasting), rel=0.15)
-    assert evidence["mean_square_over_variance"] == pytest.approx(1.0, abs=0.05)
+        assert np.sqrt(fresh[0]) == approx(FRESH_FACTOR * 0.4, rel=0.1)
+        assert np.sqrt(total[0]) == approx(np.hypot(0.4, lasting), rel=0.15)
+    assert evidence["mean_square_over_variance"] == approx(1.0, abs=0.05)
 
 
 def test_craters_seen_once_do_not_tell_what_lasts():
     every = pairs()
     once = every.select(np.arange(every.place.size) % 4 == 0)
-    with pytest.raises(DatasetError, match="several frames under one Sun"):
+    with raises(DatasetError, match="several frames under one Sun"):
         fit_sigma(once)
 
 
 def test_a_data_set_without_validation_frames_is_refused(make_blob_dataset, tmp_path):
     only_test = make_blob_dataset(tmp_path / "set", {"test": 1})
-    with pytest.raises(DatasetError, match="expected frames of split 'val'"):
+    with raises(DatasetError, match="expected frames of split 'val'"):
         fit_calibration(load_shipped_model(), [only_test])
 
 

@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from pytest import raises
 
 from lunar.constants import MOON_RADIUS_M
 from payload_emulator.errors import DatasetError, ModelError
@@ -119,10 +120,10 @@ def test_the_weight_of_small_craters_is_bounded_below(blob_dataset, monkeypatch)
     assert least(0.05) < least(0.9) < least(1.0) <= 1.0
 
 
-@pytest.mark.parametrize(("splits", "lacking"), [({"test": 1}, "train"), ({"train": 1}, "val")])
+@pytest.mark.parametrize("splits, lacking", [({"test": 1}, "train"), ({"train": 1}, "val")])
 def test_a_data_set_without_training_or_validation_frames_is_refused(make_blob_dataset, tmp_path, splits, lacking):
     empty = make_blob_dataset(tmp_path / "set", splits)
-    with pytest.raises(DatasetError, match=f"split '{lacking}', found none"):
+    with raises(DatasetError, match=f"split '{lacking}', found none"):
         train([empty], tmp_path / "run", SHORT)
     assert not (tmp_path / "run").exists()
 
@@ -130,7 +131,7 @@ def test_a_data_set_without_training_or_validation_frames_is_refused(make_blob_d
 def test_data_sets_of_two_cameras_are_refused(blob_dataset, make_blob_dataset, tmp_path):
     other = make_blob_dataset(tmp_path / "set", {"train": 1, "val": 1})
     other.index["camera"]["fov_deg"] = 90.0
-    with pytest.raises(DatasetError, match="data sets of one camera, found several"):
+    with raises(DatasetError, match="data sets of one camera, found several"):
         train([blob_dataset, other], tmp_path / "run", SHORT)
 
 
@@ -148,9 +149,9 @@ def test_a_damaged_checkpoint_is_refused_and_a_hostile_one_runs_nothing(blob_dat
     hostile = {"config": _Hostile(tmp_path / "mark")}
     for other in (b"damaged", {}, parts, parts | {"config": {"none": 1}}, hostile):
         path.write_bytes(other) if other == b"damaged" else torch.save(other, path)
-        with pytest.raises(ModelError, match="expected a checkpoint"):
+        with raises(ModelError, match="expected a checkpoint"):
             load_network(path)
-    with pytest.raises(ModelError, match="expected a checkpoint"):
+    with raises(ModelError, match="expected a checkpoint"):
         train([blob_dataset], tmp_path, SHORT)
     assert not (tmp_path / "mark").exists()
 

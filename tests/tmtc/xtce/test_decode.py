@@ -5,8 +5,8 @@ import struct
 import warnings
 
 import numpy as np
-import pytest
 import space_packet_parser as spp
+from pytest import approx, mark, raises
 
 from tests.tmtc import foreign
 from tests.tmtc.foreign import (
@@ -85,7 +85,7 @@ def same(a, b):
     return a == b or (isinstance(a, float) and isinstance(b, float) and math.isnan(a) and math.isnan(b))
 
 
-@pytest.mark.parametrize("seed", range(3))
+@mark.parametrize("seed", range(3))
 def test_an_independent_interpreter_reads_the_same_values_of_another_mission(seed, tmp_path):
     path = tmp_path / "bus.xml"
     path.write_text(foreign.BUS, encoding="utf-8")
@@ -107,7 +107,7 @@ def test_an_independent_interpreter_reads_the_same_values_of_another_mission(see
 # integers and floats of any width at any place
 
 
-@pytest.mark.parametrize("bits", range(1, 65))
+@mark.parametrize("bits", range(1, 65))
 def test_integers_of_every_width_stand_at_every_place(bits):
     rng = np.random.default_rng(bits)
     types = integer("U", bits) + integer("I", bits, "twosComplement") + integer("PAD", 1)
@@ -143,7 +143,7 @@ MIL_STD_1750A = """
 """
 
 
-@pytest.mark.parametrize("row", MIL_STD_1750A.split(","))
+@mark.parametrize("row", MIL_STD_1750A.split(","))
 def test_floats_of_mil_std_1750a_are_those_of_the_standard(row):
     octets, mantissa, exponent = row.split()
     data = bytes.fromhex(octets)
@@ -151,8 +151,8 @@ def test_floats_of_mil_std_1750a_are_those_of_the_standard(row):
     assert found["A"] == [float(mantissa) * 2.0 ** int(exponent)]
 
 
-@pytest.mark.parametrize("bits", [16, 32, 64])
-@pytest.mark.parametrize("phase", [0, 3])
+@mark.parametrize("bits", [16, 32, 64])
+@mark.parametrize("phase", [0, 3])
 def test_ieee_floats_stand_at_every_place(bits, phase):
     code = {16: "e", 32: "f", 64: "d"}[bits]
     types = floating("F", bits) + floating("L", bits, order=foreign.LITTLE) + integer("PAD", 3)
@@ -174,9 +174,9 @@ def test_a_value_outside_its_spline_is_unknown_and_keeps_its_raw_value_unless_ex
     def read(types):
         return values(layout(types, A="T"), packets)["A"]
 
-    assert read(steps) == pytest.approx([math.nan, 1.0, 1.0, 3.0, 3.0, 5.0, math.nan], nan_ok=True)
-    assert read(lines) == pytest.approx([math.nan, 1.0, 2.8, 3.0, 3.5, 5.0, math.nan], nan_ok=True)
-    assert read(on) == pytest.approx([0.8, 1.0, 2.8, 3.0, 3.5, 5.0, 5.1], rel=1e-15)
+    assert read(steps) == approx([math.nan, 1.0, 1.0, 3.0, 3.0, 5.0, math.nan], nan_ok=True)
+    assert read(lines) == approx([math.nan, 1.0, 2.8, 3.0, 3.5, 5.0, math.nan], nan_ok=True)
+    assert read(on) == approx([0.8, 1.0, 2.8, 3.0, 3.5, 5.0, 5.1], rel=1e-15)
     found = decoded(layout(lines, A="T"), packets)
     assert found.counts()["decoded"] == 7 and found.values_unknown() == {"A": 2}
     assert found.tables["P"].columns["A"].to_list(raw=True) == [9, 10, 19, 20, 25, 40, 41]
@@ -268,7 +268,7 @@ def test_a_text_without_terminator_fills_its_field_and_one_of_two_octets_stands_
     assert one(data, text_type(size, "UTF-16BE"), A="T")["A"] == ["aĀ"]
 
 
-@pytest.mark.parametrize("charset", ["US-ASCII", "UTF-8", "ISO-8859-1", "UTF-16BE", "UTF-16LE"])
+@mark.parametrize("charset", ["US-ASCII", "UTF-8", "ISO-8859-1", "UTF-16BE", "UTF-16LE"])
 def test_zeros_at_the_end_of_a_text_belong_to_it(charset):
     text = layout(text_type(fixed_size(64), charset), A="T")
     expected = ["ab\0\0", "\0\0\0\0", "a\0b\0", "abcd"] * (2 if charset.startswith("UTF-16") else 1)
@@ -449,7 +449,7 @@ def test_an_entry_may_stand_at_a_place_that_the_packet_states():
     assert values(text, packets) == {"n": [1, 2], "a": [2, 4], "b": [4, 7]}
 
 
-@pytest.mark.parametrize("kind", [integer("A", 8), text_type(fixed_size(8), name="A")])
+@mark.parametrize("kind", [integer("A", 8), text_type(fixed_size(8), name="A")])
 def test_repetitions_stand_apart_by_their_offset(kind):
     repeat = (
         f'<ParameterRefEntry parameterRef="a"><RepeatEntry><Count>{dynamic("n")}</Count>'
@@ -528,7 +528,7 @@ def test_damaged_packets_are_left_out():
     assert found.tables["P"].columns["a"].to_list() == [1] and found.verdict.tolist() == [0, 5]
 
 
-@pytest.mark.parametrize("count", [0, 1, 2, 255])
+@mark.parametrize("count", [0, 1, 2, 255])
 def test_an_array_cut_off_is_too_short_and_a_negative_count_malformed(count):
     types = integer("N", 8) + integer("E", 32) + array_type("A", "E", dimension("n", intercept=-3))
     text = layout(types, n="N", a="A")
@@ -539,9 +539,7 @@ def test_an_array_cut_off_is_too_short_and_a_negative_count_malformed(count):
         assert verdicts(text, [full[:-1]]) == ["too_short"]
 
 
-@pytest.mark.parametrize(
-    "slope, verdict", [(-8, "malformed"), (0.5, "malformed"), (1e300, "too_short"), (8, "decoded")]
-)
+@mark.parametrize("slope, verdict", [(-8, "malformed"), (0.5, "malformed"), (1e300, "too_short"), (8, "decoded")])
 def test_sizes_that_are_none_condemn_the_packet_alone(slope, verdict):
     text = layout(integer("N", 64) + binary(dynamic("n", slope=slope)), n="N", b="B")
     packets = [struct.pack(">Q", 3) + b"abc", struct.pack(">Q", 2**64 - 1) + b"abc"]
@@ -557,7 +555,7 @@ def test_an_element_that_its_calibrator_does_not_cover_is_unknown_alone():
     assert verdicts(text, packets) == ["decoded"] * 4
     found = values(text, packets)
     assert found["z"] == [1, 2, 3, 4] and found["a"][0::2] == [[5.0, 10.0], [50.0]]
-    assert found["a"][1] == pytest.approx([15.0, math.nan, 20.0], nan_ok=True)
+    assert found["a"][1] == approx([15.0, math.nan, 20.0], nan_ok=True)
     assert decoded(text, packets).values_unknown() == {"a": 1}
 
 
@@ -610,9 +608,9 @@ def test_first_containers_are_distinguished_by_their_conditions():
 
 def test_the_first_of_several_containers_is_named_and_columns_of_numbers_are_arrays():
     text = layout(integer("N", 8), container("Q", ["a"]), a="N")
-    with pytest.raises(DefinitionError, match=r"BUS: expected one container without a base, found 2 \(P, Q\)"):
+    with raises(DefinitionError, match=r"BUS: expected one container without a base, found 2 \(P, Q\)"):
         decoded(text, [b"\x01"])
-    with pytest.raises(DefinitionError, match="expected the name of a container"):
+    with raises(DefinitionError, match="expected the name of a container"):
         decoded(text, [b"\x01"], "R")
     assert list(decoded(text, [b"\x01"], "Q").tables) == ["Q"]
     column = decoded(foreign.BUS, foreign.capture(30, 1)).tables["Housekeeping"].columns["VOLTAGE"]

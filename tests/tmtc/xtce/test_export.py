@@ -5,8 +5,8 @@ import warnings
 import xml.etree.ElementTree as ET
 
 import numpy as np
-import pytest
 import space_packet_parser as spp
+from pytest import fixture, mark
 from space_packet_parser.xtce.validation import validate_xtce
 
 from tmtc.dictionary.fields import PARAMETERS, Field
@@ -18,7 +18,7 @@ from tmtc.xtce.export import format_xtce, parameter_name
 from tmtc.xtce.importing import parse_xtce
 
 
-@pytest.fixture(scope="module")
+@fixture(scope="module")
 def document(tmp_path_factory):
     """The unrolled form: the independent decoder does not support arrays."""
     path = tmp_path_factory.mktemp("xtce") / "linna.xml"
@@ -26,7 +26,7 @@ def document(tmp_path_factory):
     return path
 
 
-@pytest.fixture(scope="module")
+@fixture(scope="module")
 def decoder(document):
     return spp.load_xtce(document)
 
@@ -49,12 +49,12 @@ def test_the_form_with_arrays_validates_against_the_schema_and_is_short(tmp_path
     assert len(text) < 300_000
 
 
-@pytest.fixture(scope="module")
+@fixture(scope="module")
 def imported():
     return parse_xtce(format_xtce())
 
 
-@pytest.mark.parametrize("definition", DICTIONARY.telemetry, ids=lambda d: d.name)
+@mark.parametrize("definition", DICTIONARY.telemetry, ids=lambda d: d.name)
 def test_the_form_with_arrays_is_imported_to_equal_values_of_every_packet(definition, imported):
     rng = np.random.default_rng(18)
     counts = [0, 1, 2, 40, 255] if definition.group else [0, 0, 0]
@@ -137,7 +137,7 @@ def random_packet(definition, count, rng):
     )  # fmt: skip
 
 
-@pytest.mark.parametrize("definition", DICTIONARY.telemetry, ids=lambda d: d.name)
+@mark.parametrize("definition", DICTIONARY.telemetry, ids=lambda d: d.name)
 def test_an_independent_decoder_reads_every_packet_to_equal_values(definition, decoder):
     rng = np.random.default_rng(17)
     counts = [0, 1, 2, 40] if definition.group else [0, 0, 0]
