@@ -130,8 +130,7 @@ def import_cycles(root):
             common = next((k for k, (a, b) in enumerate(zip(mine, theirs, strict=False)) if a != b), None)
             if common is None:  # a package and its own member
                 continue
-            below = edges.setdefault(".".join(mine[:common]), {})
-            below.setdefault(mine[common], set()).add(theirs[common])
+            edges.setdefault(".".join(mine[:common]), {}).setdefault(mine[common], set()).add(theirs[common])
     cycles = []
     for package, graph in edges.items():
         reached = {start: reachable(graph, start) for start in graph}
@@ -450,8 +449,7 @@ def test_an_incomplete_release_is_not_signed(signed, key, name, capsys):
 
 def test_the_private_key_is_private_and_outside_of_the_repository(signed, key, capsys):
     assert key.stat().st_mode & 0o777 == 0o600
-    inside = ROOT / "LICENSE"
-    assert release("sign", signed, inside) == 2
+    assert release("sign", signed, ROOT / "LICENSE") == 2
     assert "outside of the repository" in capsys.readouterr().err
     key.chmod(0o640)
     assert release("sign", signed, key) == 2
@@ -463,8 +461,7 @@ def test_make_release_builds_lists_and_signs():
     rule = rules[rules.index("\nrelease:") :].split("\n\n")[0]
     words = "release: docs;-m build;deploy/materials.py bom;deploy/materials.py licences;deploy/release.sh sign"
     assert [word for word in (*words.split(";"), "LINNA_RELEASE_KEY") if word not in rule] == []
-    check = rules[rules.index("\ncheck:") :].split("\n\n")[0]
-    assert "deploy/materials.py audit $(SHIPPED)" in check
+    assert "deploy/materials.py audit $(SHIPPED)" in rules[rules.index("\ncheck:") :].split("\n\n")[0]
 
 
 def test_a_source_distribution_has_the_same_octets_whenever_and_wherever_it_is_packed(tmp_path):

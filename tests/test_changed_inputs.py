@@ -176,8 +176,7 @@ def external(folder):
 def pointing(path):
     plain = Scenario("x")
     frames = load_external(path.parent, replace(plain, camera=replace(plain.camera, width_px=64, height_px=64)))
-    ephemeris = load_orbit(frames.ephemeris)
-    check_pointing(ephemeris, frames.attitude_utc_ns, frames.q_wxyz)
+    check_pointing(load_orbit(frames.ephemeris), frames.attitude_utc_ns, frames.q_wxyz)
     found = [(frames.camera_from_icrf(t), float(np.mean(frames.image(t)))) for t in frames.utc_ns.tolist()]
     return np.concatenate([np.append(m, shade) for m, shade in found] + [(frames.utc_ns - START) / NS]), frames.words
 
@@ -637,8 +636,7 @@ def test_the_table_of_readers_has_the_names_that_the_code_reads_and_no_others(se
     rows = "\n".join(line for line in body.splitlines() if line.startswith("|"))
     stated = {name.casefold() for name in re.findall(r"`(\w[\w ()]*)`", rows)}
     code = code_of(CODE[section])
-    read = {name.casefold() for name in keys_of(code)} - NOT_OF_FILES
-    assert read <= stated
+    assert {name.casefold() for name in keys_of(code)} - NOT_OF_FILES <= stated
     assert {name for name in stated if name not in code.casefold() and " " not in name} == set()
 
 

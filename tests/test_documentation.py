@@ -238,8 +238,7 @@ def test_figures_of_pages_are_those_of_the_program():
 def test_the_animation_of_the_readme_shows_the_figures_of_the_text():
     with Image.open(DOCS / "pictures" / "tour.gif") as picture:
         shown = picture.info["comment"].decode()
-    stated = read("tutorials/first-pass.md").split("```text\n")[1].split("```")[0].strip()
-    assert shown == stated
+    assert shown == read("tutorials/first-pass.md").split("```text\n")[1].split("```")[0].strip()
     median, p95, level = re.findall(r"^anchored +(\d+) +(\d+) .*level (\d)", shown, re.MULTILINE | re.DOTALL)[0]
     navigation = read("navigation.md")
     assert f"| `linna demo` with `LINNA_DATA`, one window | {level} | {median} m | {p95} m |" in navigation

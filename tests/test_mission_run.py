@@ -150,8 +150,7 @@ def test_three_spacecraft_of_two_missions_have_the_figures_that_each_has_alone(t
 @mark.campaign
 def test_time_that_does_not_wait_gives_reports_too(tmp_path):
     terms = replace(TERMS, factor=300.0)
-    scenarios = [parse_scenario(text) for text in (SCENARIO, SECOND)]
-    fleet = run_fleet(scenarios, NO_DATA, tmp_path, terms, print)["fleet"]
+    fleet = run_fleet([parse_scenario(text) for text in (SCENARIO, SECOND)], NO_DATA, tmp_path, terms, print)["fleet"]
     for figures in fleet.values():
         assert figures["windows"]["processed"] == figures["reports"] == 1 and figures["packets_lost"] == 0
         assert figures["wall_s"] > 0.25 * 86_400.0 / 300.0
@@ -339,8 +338,7 @@ def test_a_restored_checkpoint_has_archive_spacecraft_and_progress_of_one_moment
         checkpoints.keep(progress)
     write(3)
     (home / "incoming" / "segment").touch()
-    kept = checkpoints.restore()
-    assert kept.read_text() == snapshot.read_text() == "2"
+    assert checkpoints.restore().read_text() == snapshot.read_text() == "2"
     with closing(sqlite3.connect(home / "linna.db")) as connection:
         assert connection.execute("select number from one").fetchall() == [(1,), (2,)]
     assert not (home / "incoming").exists()
@@ -395,8 +393,7 @@ def test_windows_are_requested_where_rasters_and_catalogue_describe_the_ground()
     equator = observed_boxes(flat_terrain(listed, []), 13.0)
     assert equator == [Box(0.0, 15.0, -13.0, 13.0), Box(15.0, 30.0, 32.0, 58.0)]
     # Ground with height rasters alone, also further away from the equator: coarse ones show few craters.
-    covered = observed_boxes(flat_terrain(listed, [(0.0, 0.0), (15.0, 0.0)]), 13.0)
-    assert covered == [Box(0.0, 15.0, 2.0, 28.0)]
+    assert observed_boxes(flat_terrain(listed, [(0.0, 0.0), (15.0, 0.0)]), 13.0) == [Box(0.0, 15.0, 2.0, 28.0)]
     # Part of the height is not enough.
     assert observed_boxes(flat_terrain(listed, [(0.0, 0.0)]), 13.0) == equator
     assert observed_boxes(SimpleNamespace(is_real=False), 13.0) == [Box(-180.0, 180.0, -13.0, 13.0)]

@@ -31,8 +31,7 @@ def home(tmp_path_factory):
 
 def regress(suite, home, build, capsys):
     words = ["--archive", str(suite), "--build", build, "--home", str(home), "--json"]
-    status = cli.run(["regress", "run", *words])
-    return status, json.loads(capsys.readouterr().out)
+    return cli.run(["regress", "run", *words]), json.loads(capsys.readouterr().out)
 
 
 def test_the_shipped_network_and_parameters_pass_their_own_suite(suite, home, capsys):

@@ -229,8 +229,7 @@ def test_a_wrong_token_and_a_wrong_server_are_reported_in_one_line(typed, server
     assert wrong.strip() == "linna: error: token: expected one that 'linna user add' gave out, found another"
     gone = typed("pass list --server http://127.0.0.1:1 --json", 2)
     assert gone.startswith("linna: error: http://127.0.0.1:1: cannot be reached")
-    odd = typed("pass list --server ftp://x --json", 2)
-    assert "expected a URL such as" in odd
+    assert "expected a URL such as" in typed("pass list --server ftp://x --json", 2)
 
 
 def test_a_failed_job_is_reported_in_one_line_that_names_the_file(tmp_path):

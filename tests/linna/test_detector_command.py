@@ -13,8 +13,7 @@ from tests.payload_emulator.bowls import BOWL_CENTRES, bowl_image
 
 
 def speckled(shape=(512, 512), dtype=np.uint8):
-    rng = np.random.default_rng(2)
-    return (rng.integers(30, 220, shape) * (np.iinfo(dtype).max // 255)).astype(dtype)
+    return (np.random.default_rng(2).integers(30, 220, shape) * (np.iinfo(dtype).max // 255)).astype(dtype)
 
 
 @fixture

@@ -73,8 +73,7 @@ def test_a_conversion_prints_as_many_states_as_it_writes(tmp_path, typed, ending
     path, out = tmp_path / "two.oem", tmp_path / f"out{ending}"
     save_oem(Ephemeris((first, later)), path)
     assert typed(f"orbit convert {path} --out {out} --json")["states"] == count
-    rows = [line for line in out.read_text().splitlines() if line[0:1].isdigit() and len(line) > 60]
-    assert len(rows) == count
+    assert len([line for line in out.read_text().splitlines() if line[0:1].isdigit() and len(line) > 60]) == count
 
 
 def test_figures_of_states_that_gravity_does_not_move_are_refused(tmp_path, typed):
@@ -97,8 +96,7 @@ def test_a_kernel_without_its_number_an_unknown_format_and_a_file_cut_short_are_
 def test_interpolate_gives_states_at_the_epochs_of_a_file(oem_path, tmp_path, typed):
     epochs = tmp_path / "epochs.txt"
     epochs.write_text("# two epochs\n2029-08-07T00:00:00Z\n\n2029-08-07T12:34:56.789123Z  # odd\n")
-    figures = typed(f"orbit interpolate {oem_path} --epochs {epochs} --json")
-    first, second = figures["states"]
+    first, second = typed(f"orbit interpolate {oem_path} --epochs {epochs} --json")["states"]
     assert set(first) == {*("epoch", "position_km", "velocity_km_s", "latitude_deg", "longitude_deg", "altitude_km")}
     assert second["epoch"] == "2029-08-07T12:34:56.789123000Z"
     assert np.linalg.norm(second["position_km"]) == approx(1768.18, abs=1e-6)

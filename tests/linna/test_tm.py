@@ -289,8 +289,7 @@ def test_the_configuration_of_yamcs_is_written_for_a_spacecraft_and_a_station(tm
     command = f"tm yamcs --out {tmp_path}/y --spacecraft-id 77 --station host"
     files = typed(f"{command}:1234 --json")["files"]
     assert sorted(files) == sorted(str(path) for path in (tmp_path / "y").rglob("*.*"))
-    instance = YAML(typ="safe").load((tmp_path / "y/etc/yamcs.linna.yaml").read_text())
-    frames, telecommands = instance["dataLinks"]
+    frames, telecommands = YAML(typ="safe").load((tmp_path / "y/etc/yamcs.linna.yaml").read_text())["dataLinks"]
     assert (frames["spacecraftId"], frames["frameLength"], frames["errorDetection"]) == (77, 1115, "CRC16")
     assert [one["vcId"] for one in frames["virtualChannels"]] == [0, 1]
     assert (telecommands["host"], telecommands["port"]) == ("host", 1234)

@@ -41,14 +41,12 @@ def test_the_facts_of_the_paper_hold_to_their_printed_digits():
 
 
 def test_projection_is_that_of_opencv_about_the_middle_and_to_half_the_field_of_view():
-    rng = np.random.default_rng(1)
-    points = rng.uniform([-50e3, -50e3, 10e3], [50e3, 50e3, 60e3], (100, 3))
+    points = np.random.default_rng(1).uniform([-50e3, -50e3, 10e3], [50e3, 50e3, 60e3], (100, 3))
     f, (cx, cy) = CAMERA.focal_px, CAMERA.centre_px
     theirs, _ = cv2.projectPoints(points, np.zeros(3), np.zeros(3), np.array([[f, 0, cx], [0, f, cy], [0, 0, 1]]), None)
     assert np.allclose(CAMERA.project(points), theirs[:, 0], atol=1e-9)
     assert CAMERA.centre_px == (255.5, 255.5)
-    edge = CAMERA.rays(np.array([511.5, 255.5]))
-    assert math.degrees(math.acos(edge[2])) == approx(60.0, abs=1e-12)
+    assert math.degrees(math.acos(CAMERA.rays(np.array([511.5, 255.5]))[2])) == approx(60.0, abs=1e-12)
 
 
 @given(latitudes, longitudes, altitudes_m)
@@ -204,8 +202,7 @@ def test_craters_are_found_over_the_meridian_and_the_pole_and_nothing_to_study_i
         np.radians([0.0, 0.0, 89.9, 89.9, 0.2]), np.radians([359.9, 0.1, 10.0, 190.0, 0.0]), [6e3] * 5,
         source="five",
     )  # fmt: skip
-    positions = mcmf_from_spherical(np.radians([0.0, 90.0]), np.radians([0.0, 0.0]), 30e3)
-    study = study_field_of_view(positions, catalogue)
+    study = study_field_of_view(mcmf_from_spherical(np.radians([0.0, 90.0]), np.radians([0.0, 0.0]), 30e3), catalogue)
     assert np.count_nonzero(np.isfinite(np.tan(np.radians(study.required_fov_deg / 2)))[0]) >= 3
     assert study.required_fov_deg[0][2] < 30.0 and study.required_fov_deg[1][1] < 30.0
     with raises(LunarError, match="expected craters of 5-30 km under the orbit"):

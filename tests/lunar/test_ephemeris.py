@@ -71,8 +71,7 @@ def test_hermite_interpolation_is_that_of_scipy_on_the_same_states(degree):
         nodes = IRREGULAR_S[first : first + count]
         p, v = circle(nodes)
         middle = nodes.mean()
-        knots = np.repeat(nodes - middle, 2)
-        theirs = KroghInterpolator(knots, np.stack([p, v], 1).reshape(-1, 3))
+        theirs = KroghInterpolator(np.repeat(nodes - middle, 2), np.stack([p, v], 1).reshape(-1, 3))
         # Rounding of 1.8e6 m in float64 is 0.2 nm; epochs are rounded to 1 ns = 2 um along track.
         assert np.allclose(position[k], theirs(t - middle), atol=1e-5)
         assert np.allclose(velocity[k], theirs.derivative(t - middle), atol=1e-8)
@@ -171,8 +170,7 @@ def test_epochs_between_segments_and_in_a_hole_of_their_states_are_refused():
     assert ephemeris.covers(START + np.array([600, 601, 899, 900]) * NS).tolist() == [True, False, False, True]
     with raises(EphemerisCoverageError, match=r"00:10:00.000Z, 2029-08-07T00:15:00.000Z"):
         at_s(ephemeris, 700.0)
-    elapsed = np.concatenate([np.arange(0.0, 601.0, 30.0), np.arange(3600.0, 4201.0, 30.0)])
-    ephemeris = arc(elapsed)
+    ephemeris = arc(np.concatenate([np.arange(0.0, 601.0, 30.0), np.arange(3600.0, 4201.0, 30.0)]))
     assert ephemeris.covers(START + np.array([600, 601, 3599, 3600]) * NS).tolist() == [True, False, False, True]
     at_s(ephemeris, [600.0, 3600.0])
     with raises(EphemerisCoverageError, match=r"with a gap 2029-08-07T00:10:00.000Z..2029-08-07T01:00:00.000Z"):
@@ -190,8 +188,7 @@ def test_a_leap_second_inside_a_segment_does_no_harm():
     # 30 s of true time before midnight it is 23:59:31: the day has 86,401 s.
     elapsed = np.arange(-300.0, 301.0, 30.0)
     utc_ns = leap + np.rint((elapsed + (elapsed < 0.0)) * NS).astype(np.int64)
-    ephemeris = ephemeris_from_states(utc_ns, *circle(elapsed))
-    position, _ = ephemeris.at(leap + np.array([-9, 15]) * NS)
+    position, _ = ephemeris_from_states(utc_ns, *circle(elapsed)).at(leap + np.array([-9, 15]) * NS)
     assert np.allclose(position, circle([-10.0, 15.0])[0], atol=1e-4)
 
 
@@ -291,8 +288,7 @@ def rotation_about(axis, angle_rad):
 def test_nothing_is_interpolated_across_a_burn_between_two_states():
     orbit = polar_orbit(4.0)
     covariances = tuple(Covariance(START + k * 60 * NS, "ICRF", np.eye(6)) for k in (10, 200))
-    burned = with_states(turned(orbit, 0.001), lambda one: {"covariances": covariances})
-    cut = cut_at_burns(burned)
+    cut = cut_at_burns(with_states(turned(orbit, 0.001), lambda one: {"covariances": covariances}))
     assert [len(one.utc_ns) for one in cut.segments] == [121, 120]
     assert [one.covariances for one in cut.segments] == [covariances[:1], covariances[1:]]
     assert cut.covers(START + np.array([7200, 7230, 7260]) * NS).tolist() == [True, False, True]
@@ -434,8 +430,7 @@ def test_every_reading_of_the_onboard_clock_survives_utc_and_back(ticks):
 
 @mark.parametrize("system", TIME_SYSTEMS)
 def test_every_time_system_of_a_file_converts_there_and_back(system):
-    utc_ns = parse_utc("2029-08-07T00:00:00") + np.arange(5) * 86_400 * NS
-    tai_ns = tai_ns_from_utc_ns(utc_ns)
+    tai_ns = tai_ns_from_utc_ns(parse_utc("2029-08-07T00:00:00") + np.arange(5) * 86_400 * NS)
     assert np.array_equal(to_tai_ns(from_tai_ns(tai_ns, system), system), tai_ns)
 
 

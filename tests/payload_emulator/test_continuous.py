@@ -155,8 +155,7 @@ def running(session):
 
 def flown(scenario, hours, act=lambda ground, contact: None, **options):
     """Fly a session for some hours from its epoch, with a client."""
-    stop = EPOCH + round(hours * HOUR_NS)
-    session = opened(scenario, holds=True, stop_utc_ns=stop, **options)
+    session = opened(scenario, holds=True, stop_utc_ns=EPOCH + round(hours * HOUR_NS), **options)
     with running(session):
         ground = Ground(session, act)
     ground.close()
@@ -222,8 +221,7 @@ def test_the_clock_drifts_as_the_scenario_says_by_its_time_reports(flight):
     # The on-board clock counts TAI since 2000-01-01 TAI, 32 s of leap seconds before it in UTC.
     zero = int(tai_ns_from_utc_ns(parse_utc("2000-01-01T00:00:00Z"))) - 32 * NS
     elapsed_s = (np.asarray(tai_ns_from_utc_ns(received)) - zero) / NS
-    error_s = ticks / 65_536.0 - elapsed_s + 1.28
-    drift, offset = np.polyfit((received - EPOCH) / NS, error_s, 1)
+    drift, offset = np.polyfit((received - EPOCH) / NS, ticks / 65_536.0 - elapsed_s + 1.28, 1)
     # The light time of 1.18 to 1.36 s changes by some ms a day.
     assert drift * 1e6 == approx(5.0, abs=0.5)
     assert offset == approx(0.4, abs=0.15)
@@ -270,8 +268,7 @@ def test_a_contact_ends_with_an_outage_of_its_station_and_later_telecommands_are
 def test_the_uplink_carries_no_more_than_its_rate():
     """At 8 bit/s a contact of half an hour takes a part of 2000 telecommands; the others are lost."""
     slow = parse_scenario(SCENARIO.replace("uplink_bps = 64000.0", "uplink_bps = 8.0") + SHORT)
-    act = first(lambda ground: [ground.command("test_connection") for _ in range(2_000)])
-    session, ground = flown(slow, 4.5, act)
+    session, ground = flown(slow, 4.5, first(lambda ground: [ground.command("test_connection") for _ in range(2_000)]))
     start, stop = (parse_utc(one["utc"]) for one in ground.contacts[:2])
     seconds, packet = (stop - start) / NS, len(ground.command("test_connection"))
     assert session.account.telecommands == approx(seconds / packet, abs=2)
@@ -376,8 +373,7 @@ def test_records_that_are_not_acknowledged_come_again_on_the_next_connection():
 
 def test_the_mission_description_names_stations_and_links():
     world = open_world(scenario(SHORT), DataFolder(None))
-    text = live_mission_text(world, DataFolder(None), "127.0.0.1", {"madrid": (1, 2)}, OPERATIONS)
-    mission = parse_mission(text)
+    mission = parse_mission(live_mission_text(world, DataFolder(None), "127.0.0.1", {"madrid": (1, 2)}, OPERATIONS))
     assert mission.link.stations is not None
     assert mission.link.stations["madrid"].latitude_deg == 40.43
     assert mission.link.stations["madrid"].outages == ("2029-08-07T04:00:00.000Z/2029-08-07T23:00:00.000Z",)
@@ -437,8 +433,7 @@ def test_the_network_and_the_threshold_in_force_are_stated(world):
     assert own.sha256 == hashlib.sha256(load_shipped_model()).hexdigest()
     assert own.score_threshold == 0.44  # in the metadata of the shipped network
     detector = DetectorSection(score_threshold=0.61, max_detections=80)
-    changed = replace(world, scenario=replace(world.scenario, detector=detector))
-    stated = stated_of(changed).detector
+    stated = stated_of(replace(world, scenario=replace(world.scenario, detector=detector))).detector
     assert (stated.score_threshold, stated.max_detections) == (0.61, 80)
     lost = replace(world, scenario=replace(world.scenario, detector=DetectorSection(network="lost.onnx")))
     with raises(ModelError, match=r"expected craters.* or an ONNX file, found 'lost.onnx'"):
@@ -513,8 +508,7 @@ def test_what_windows_need_is_stated(world):
     ):
         navigation = replace(scenario.navigation, estimators=estimators)
         flown = replace(world, scenario=replace(scenario, navigation=navigation))
-        text = live_mission_text(flown, DataFolder(), "127.0.0.1", {"earth": (1, 2)}, OPERATIONS)
-        stated = parse_mission(text)
+        stated = parse_mission(live_mission_text(flown, DataFolder(), "127.0.0.1", {"earth": (1, 2)}, OPERATIONS))
         assert stated.uploads is not None and stated.uploads.tables == tables
         assert stated.time.correlation == "automatic" and stated.critical_in_windows == ()
 
@@ -557,8 +551,7 @@ def test_the_unseen_share_counts_frames_whose_whole_footprint_is_unseen(longitud
 
 
 def test_the_ground_of_training_is_stated_over_real_terrain(world):
-    real = replace(world, terrain=cast(Any, RealTerrain(world.terrain)))
-    evidence = stated_of(real).evidence
+    evidence = stated_of(replace(world, terrain=cast(Any, RealTerrain(world.terrain)))).evidence
     assert evidence.trained_regions == trained_ground()
     assert (evidence.unseen_share, evidence.level) == (None, None)  # each pass has its own
 

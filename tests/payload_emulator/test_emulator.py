@@ -102,8 +102,7 @@ def test_the_machine_tells_of_its_faults_and_finishes_the_window(archive):
     # No frame is seen twice, and none goes back in time.
     table = tables["detections"]
     _, first = np.unique(table.ticks, return_index=True)
-    frames = table.columns["frame_number"][first]
-    assert np.all(np.diff(frames) >= 1)
+    assert np.all(np.diff(table.columns["frame_number"][first]) >= 1)
 
 
 def test_the_dumps_are_listed_with_the_times_they_left(archive):
@@ -129,8 +128,7 @@ def test_the_ground_finds_the_time_of_every_frame_from_time_reports(archive, tmp
     true = np.loadtxt(out / "frame_times.csv", delimiter=",", skiprows=1, dtype=np.int64)
     with open_ground(tmp_path / "home") as ground:
         follow_in_process(ground)
-        key = import_archive(ground, out)
-        found = load_pass_inputs(ground, key).detections
+        found = load_pass_inputs(ground, import_archive(ground, out)).detections
         lines = ground.read(correlations_in_force, 1)
     assert [line.boot_count for line in lines] == [1, 2]
     assert lines[1].drift_ppb == approx(-3000.0, abs=200.0)
@@ -162,8 +160,7 @@ def test_a_named_anchoring_table_is_uploaded_as_it_is(tmp_path):
     )  # fmt: skip
     named = tmp_path / "three.table"
     named.write_bytes(pack_catalogue_table(table))
-    scenario = parse_scenario(SHORT).with_choices(anchoring_catalogue=named)
-    emulate(scenario, find_data(None), tmp_path / "pass")
+    emulate(parse_scenario(SHORT).with_choices(anchoring_catalogue=named), find_data(None), tmp_path / "pass")
     manifest = json.loads((tmp_path / "pass" / "manifest.json").read_text())
     assert manifest["tables"]["catalogue"] == hashlib.sha256(named.read_bytes()).hexdigest()
 
@@ -212,8 +209,7 @@ EPOCH = parse_utc("2029-08-07T00:10:00Z")
 @fixture(scope="module")
 def scenario():
     scenario = load_scenario(SHIPPED / "selenita.toml")
-    terrain = replace(scenario.terrain, source="procedural")
-    return replace(scenario, terrain=terrain)
+    return replace(scenario, terrain=replace(scenario.terrain, source="procedural"))
 
 
 @fixture(scope="module")
@@ -261,8 +257,7 @@ def circle():
     u = RATE * TIMES_NS / 1e9
     zero = np.zeros_like(u)
     position = RADIUS_M * np.stack([np.cos(u), np.sin(u), zero], axis=1)
-    velocity = RATE * RADIUS_M * np.stack([-np.sin(u), np.cos(u), zero], axis=1)
-    return ephemeris_from_states(TIMES_NS, position, velocity)
+    return ephemeris_from_states(TIMES_NS, position, RATE * RADIUS_M * np.stack([-np.sin(u), np.cos(u), zero], axis=1))
 
 
 def errors_rtn_m(section, seed):
@@ -294,8 +289,7 @@ def test_the_wrong_orbit_is_an_orbit():
             k1 = slope(state)
             k2 = slope(state + 0.5 * h * k1)
             k3 = slope(state + 0.5 * h * k2)
-            k4 = slope(state + h * k3)
-            state = state + h / 6.0 * (k1 + 2.0 * k2 + 2.0 * k3 + k4)
+            state = state + h / 6.0 * (k1 + 2.0 * k2 + 2.0 * k3 + slope(state + h * k3))
         worst = max(worst, float(np.linalg.norm(state[:3] - wrong.position_m[k])))
     assert np.abs(errors_rtn_m(SECTION, 3)).max() > 5.0
     assert worst < 0.02
@@ -327,8 +321,7 @@ def test_the_reference_of_a_shipped_scenario_is_not_the_truth(path):
     text = path.read_text()
     if "[dataset" in text:
         return
-    sigma = load_scenario(path).reference.sigma_rtn_m
-    assert 10.0 <= math.hypot(*sigma) <= 100.0
+    assert 10.0 <= math.hypot(*load_scenario(path).reference.sigma_rtn_m) <= 100.0
 
 
 def test_the_arcs_of_a_flown_ephemeris_are_those_of_the_reference():
@@ -336,8 +329,7 @@ def test_the_arcs_of_a_flown_ephemeris_are_those_of_the_reference():
     one = circle().segments[0]
     first = replace(one, utc_ns=one.utc_ns[:60], tai_ns=None, **states_of(one, slice(None, 60), 1.0))
     second = replace(one, utc_ns=one.utc_ns[59:], tai_ns=None, **states_of(one, slice(59, None), 1.00565))
-    flown = Ephemeris((first, second))
-    found = sample_truth(_truth_of_ephemeris(flown, IauOrientation()), TIMES_NS[[30, 90]])
+    found = sample_truth(_truth_of_ephemeris(Ephemeris((first, second)), IauOrientation()), TIMES_NS[[30, 90]])
     assert found.segments[0].stop_utc_ns == found.segments[1].start_utc_ns == TIMES_NS[59]
     radii = np.linalg.norm([found.segments[0].position_m[-1], found.segments[1].position_m[0]], axis=1)
     assert_allclose(radii, [RADIUS_M, 1.00565 * RADIUS_M], atol=1.0)

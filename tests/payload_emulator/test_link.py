@@ -140,8 +140,7 @@ def circling(hours=4.0):
     rate = np.sqrt(4.9028e12 / 1.7674e6**3)
     angle = rate * (times - EPOCH)[:, None] / 1e9
     position = 1.7674e6 * (np.cos(angle) * u + np.sin(angle) * w)
-    velocity = 1.7674e6 * rate * (np.cos(angle) * w - np.sin(angle) * u)
-    return ephemeris_from_states(times, position, velocity)
+    return ephemeris_from_states(times, position, 1.7674e6 * rate * (np.cos(angle) * w - np.sin(angle) * u))
 
 
 def test_contacts_end_behind_the_limb_of_the_moon_once_an_orbit():

@@ -202,8 +202,7 @@ def test_the_scenario_runs_through_and_the_machine_goes_on(running):
     messages = watcher.until(
         lambda message: message["kind"] == "turn" and message["mode"] == "standby" and live.account.frames == 16
     )
-    frames = [message["frame"] for message in messages if message["kind"] == "frame"]
-    assert frames == list(range(16))
+    assert [message["frame"] for message in messages if message["kind"] == "frame"] == list(range(16))
     assert {message["estimates"]["spherical"]["outcome"] for message in messages if message["kind"] == "frame"} <= {
         "anchored", "multi", "single", "predicted",
     }  # fmt: skip

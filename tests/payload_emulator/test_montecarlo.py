@@ -83,8 +83,7 @@ def test_errors_of_a_run_differ_for_each_seed(case_of):
 
 
 def test_a_common_pixel_bias_hides_from_the_innovations_and_shows_in_the_errors(case_of):
-    biased = case_of(150, detector=SimulatedDetector(bias_px=(1.0, 0.0)))
-    result = consistency([fly(biased, 3)])
+    result = consistency([fly(case_of(150, detector=SimulatedDetector(bias_px=(1.0, 0.0))), 3)])
     assert result.nis_per_degree <= 1.15
     assert result.anees > 10.0
 
@@ -108,24 +107,20 @@ def test_an_attitude_of_a_degree_neither_diverges_nor_lies(case_of):
 
 @mark.parametrize("seed", [1, *(pytest.param(one, marks=mark.campaign) for one in (2, 3))])
 def test_an_unannounced_jump_of_five_kilometres_is_noticed_and_mended(case_of, seed):
-    case = case_of(80, kidnap=Kidnap(50, 5_000.0, announced=False))
-    run = fly(case, seed)
+    run = fly(case_of(80, kidnap=Kidnap(50, 5_000.0, announced=False)), seed)
     assert run.error_m[49] < 300.0
     assert run.error_m[50] > 4_000.0
     assert np.all(run.error_m[58:] < 500.0)
 
 
 def test_an_announced_jump_of_tens_of_kilometres_is_mended_within_four_frames(case_of):
-    case = case_of(40, kidnap=Kidnap(25, 50_000.0, announced=True))
-    run = fly(case, 4)
-    assert np.all(run.error_m[29:] < 500.0)
+    assert np.all(fly(case_of(40, kidnap=Kidnap(25, 50_000.0, announced=True)), 4).error_m[29:] < 500.0)
 
 
 def test_after_hours_without_a_camera_the_first_frames_bring_the_orbit_back(case_of):
     imaging = np.ones(760, dtype=bool)
     imaging[20:740] = False
-    case = case_of(760, imaging=imaging)
-    run = fly(case, 5)
+    run = fly(case_of(760, imaging=imaging), 5)
     assert np.all(run.outcome[20:740] == Outcome.no_image)
     assert np.all(run.error_m[743:] < 500.0)
 
@@ -144,8 +139,7 @@ def test_a_wrong_catalogue_is_refused_and_the_orbit_coasted(case_of):
 def test_false_detections_alone_give_no_fix(case_of):
     blind = SimulatedDetector(recall=(0.0, 0.0, 0.0, 0.0), precision=0.06)
     for sigma, frames in ((100.0, 60), (10_000.0, 6)):
-        case = case_of(frames, detector=blind, start_position_m=sigma, start_velocity_m_s=0.1)
-        run = fly(case, 7)
+        run = fly(case_of(frames, detector=blind, start_position_m=sigma, start_velocity_m_s=0.1), 7)
         assert np.count_nonzero(run.fixed) <= 2
         assert set(run.outcome.tolist()) <= {Outcome.fixed, Outcome.coasted, Outcome.refused}
     # The wide search was tried, found nothing safe, and says so.
@@ -197,8 +191,7 @@ def test_craters_that_the_payload_mapped_are_met_again_and_their_errors_known(mo
     monkeypatch.setattr(
         landmark_map, "map_rows", lambda made: replace(rows(made), sigma_m=believed * rows(made).sigma_m)
     )
-    case = standard_case(DataFolder(), "tuning", 2.1, catalogued=0.2)
-    run = fly(case, 31)
+    run = fly(standard_case(DataFolder(), "tuning", 2.1, catalogued=0.2), 31)
     result = consistency([run], settle_frames=444)
     assert result.own_share > 0.3 and run.findable.mean() < 4.0  # of twelve craters that are detected
     # A map believed twenty times too much is found out by the errors.

@@ -117,8 +117,7 @@ def test_frames_are_rendered_with_the_data_that_the_archive_declares(copy, tmp_p
 def test_received_detections_replace_the_frames_that_an_archive_lacks(copy, tmp_path):
     """A replay from received detections reports the same detections; navigation differs by their resolution only."""
     flown = (copy / "downlink.cadu").read_bytes()
-    kept = with_detections(replace(check_archive(copy), reason="no frames"))
-    assert kept.has_inputs
+    assert with_detections(replace(check_archive(copy), reason="no frames")).has_inputs
     shutil.rmtree(copy / "frames")
     replay_archive(copy, FlightBuild(), tmp_path / "out")
     again = (tmp_path / "out/downlink.cadu").read_bytes()
@@ -197,8 +196,7 @@ def test_an_archive_that_cannot_be_flown_says_why(copy, tmp_path):
 def test_a_parameter_of_older_code_is_dropped_and_reported(copy, tmp_path):
     path = copy / "payload/parameters.toml"
     path.write_text(path.read_text().replace("[detector]\n", "[detector]\nforgotten = 3\n"))
-    summary = replay_archive(copy, FlightBuild(), tmp_path / "out")
-    assert summary["dropped"] == ["detector.forgotten"]
+    assert replay_archive(copy, FlightBuild(), tmp_path / "out")["dropped"] == ["detector.forgotten"]
 
 
 def test_a_build_changes_the_parameters_that_it_names_only(archive, tmp_path):
@@ -207,8 +205,7 @@ def test_a_build_changes_the_parameters_that_it_names_only(archive, tmp_path):
     build = load_flight_build(tmp_path / "build.toml")
     assert not names_command(tmp_path / "build.toml")
     plain = replay_archive(archive, FlightBuild(), tmp_path / "plain")
-    strict = replay_archive(archive, build, tmp_path / "strict")
-    assert strict["detections"] < plain["detections"]
+    assert replay_archive(archive, build, tmp_path / "strict")["detections"] < plain["detections"]
 
 
 def test_a_build_flies_its_own_network(archive):
@@ -237,8 +234,7 @@ def test_parameters_survive_their_file_and_one_can_be_set_by_its_dotted_name():
     assert again == parameters
     assert again.flight.sha256 == parameters.flight.sha256
     assert BuildParameters().flight.anchored.gravity_degree == 100
-    changed = parse_parameters("flight.anchored.gravity_degree = 4")
-    assert changed.flight.anchored.gravity_degree == 4
+    assert parse_parameters("flight.anchored.gravity_degree = 4").flight.anchored.gravity_degree == 4
 
 
 BAD = """
@@ -371,8 +367,7 @@ def test_a_pass_that_is_given_back_shows_the_payload_the_same(flown, tmp_path, c
         np.testing.assert_allclose(other["attitude"][:4], one["attitude"][:4], atol=1e-9)
     assert 'world = "photographs"' in (out / "mission.toml").read_text()
     # Nothing outside the archive is needed to fly it again.
-    replayed = replay_archive(out, FlightBuild(), tmp_path / "replayed")
-    assert replayed["frames"] == 3
+    assert replay_archive(out, FlightBuild(), tmp_path / "replayed")["frames"] == 3
 
 
 def test_frames_whose_sun_is_not_that_of_the_ephemeris_are_named_with_both_azimuths(flown, tmp_path, monkeypatch):
@@ -457,8 +452,7 @@ def test_a_broken_folder_is_refused_in_one_line(flown, tmp_path, capsys, edit, w
     folder = copied(flown, tmp_path / "given")
     edit(folder)
     assert run(["emulate", "--images", str(folder), "--out", str(tmp_path / "out")]) == 2
-    error = capsys.readouterr().err.strip().splitlines()
-    assert words in error[-1]
+    assert words in capsys.readouterr().err.strip().splitlines()[-1]
     assert not (tmp_path / "out").exists()
 
 

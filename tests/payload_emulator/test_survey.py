@@ -114,8 +114,7 @@ def test_recall_is_counted_by_size_and_by_depth_with_the_limits_in_their_groups(
 
 
 def test_what_is_unknown_has_no_figure_and_a_session_without_settled_windows_is_refused():
-    lone = session(window(nis=None, coast_end_m=None)).model_copy(update={"registered_share": 0.0})
-    figures = summary([lone])
+    figures = summary([session(window(nis=None, coast_end_m=None)).model_copy(update={"registered_share": 0.0})])
     assert {figures[name] for name in ("nis", "nees_trend", "coast_end_p95_m")} == {None}
     text = format_survey(figures)
     assert "not registered" in text and "NIS unknown" in text
@@ -184,8 +183,7 @@ def test_classes_have_the_papers_colours_and_labels_outside_are_not_drawn():
 
 
 def test_a_sheet_has_a_place_for_every_picture_and_its_caption():
-    pictures = [np.full((40, 50, 3), 30 + 50 * n, np.uint8) for n in range(4)]
-    sheet = contact_sheet(pictures, ["a", "b", "c", "d"], 3)
+    sheet = contact_sheet([np.full((40, 50, 3), 30 + 50 * n, np.uint8) for n in range(4)], ["a", "b", "c", "d"], 3)
     assert sheet.shape == (2 * (40 + 22 + 4) + 4, 3 * (50 + 4) + 4, 3)
     assert (sheet[4:44, 58:108] == 80).all()
     # The fourth picture begins the second row.

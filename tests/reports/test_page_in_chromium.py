@@ -70,8 +70,7 @@ def test_nothing_runs_out_of_the_window(browser, width):
 def test_text_and_figures_are_legible_in_both_themes(browser, scheme):
     browser.theme(scheme)
     # 4.5 is WCAG AA for text; labels in the colour of their line are held to the 3 of graphics.
-    weak = browser.value(_CONTRAST.replace("LIMIT", "3.0"))
-    assert weak == []
+    assert browser.value(_CONTRAST.replace("LIMIT", "3.0")) == []
     assert browser.value(_CONTRAST.replace("LIMIT", "4.5").replace(",svg text", "")) == []
     browser.theme("light")
 

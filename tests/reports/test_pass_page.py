@@ -146,8 +146,7 @@ def test_only_false_alarms_of_the_scored_classes_are_marked_as_false(whole_pass)
     nothing = np.zeros(len(frame.detection_u_px), np.bool_)
 
     def marks(size_class):
-        classes = np.full(len(nothing), size_class, np.int64)
-        shown = replace(frame, detection_matched=nothing, detection_class=classes)
+        shown = replace(frame, detection_matched=nothing, detection_class=np.full(len(nothing), size_class, np.int64))
         return draw_svg("g", 3.0, 3.5, lambda c: draw_gallery(c, (shown,), 1), "one frame").count(FALSE_TINT)
 
     assert marks(0) == 1, "one compound path holds all crosses of a colour"
@@ -158,8 +157,7 @@ def test_a_given_reason_replaces_the_usual_one_and_a_pass_without_a_reference_sh
     text = of_pass(not_available={"gallery": "images were not asked for in this window"}).text
     assert "Gallery of detections not available: images were not asked for in this window" in text
     assert "gallery: images were not asked for in this window" in text
-    nothing = np.full((40, 3), np.nan)
-    one = _series(40, error_rtn_m=nothing, outcome=("fixed",) * 30 + ("coasted",) * 10)
+    one = _series(40, error_rtn_m=np.full((40, 3), np.nan), outcome=("fixed",) * 30 + ("coasted",) * 10)
     text = of_pass(navigation=(one,)).text
     assert "Position error not available: no reference ephemeris covers the pass" in text
     assert "Fixed on the catalogue" in text and "75.0 %" in text
@@ -214,8 +212,7 @@ def test_single_wild_values_do_not_break_a_page():
     n = 60
     error = np.full((n, 3), 12.0)
     error[[7, 9, 11]] = [[1e12], [np.inf], [0.0]]
-    one = _series(n, error_rtn_m=error, sigma_rtn_m=np.full((n, 3), 1e-9))
-    assert of_pass(navigation=(one,)).left_open == []
+    assert of_pass(navigation=(_series(n, error_rtn_m=error, sigma_rtn_m=np.full((n, 3), 1e-9)),)).left_open == []
 
 
 def test_half_a_downlink_shows_the_share_that_came():

@@ -103,8 +103,7 @@ def test_a_wide_table_is_set_in_smaller_type():
     """Twenty numeric columns do not overlap: each number starts right of the previous one."""
     columns = tuple(Column(f"c{i}") for i in range(20))
     row = tuple(f"{12_345 + i}" for i in range(20))
-    reader = PdfReader(io.BytesIO(pdf_pages(document(Table("Wide.", columns, (row,))))))
-    text = reader.pages[0].extract_text()
+    text = PdfReader(io.BytesIO(pdf_pages(document(Table("Wide.", columns, (row,)))))).pages[0].extract_text()
     assert all(number in text for number in row)
     places = [text.index(number) for number in row]
     assert all(a < b for a, b in pairwise(places))

@@ -295,8 +295,7 @@ def test_a_dictionary_that_defines_a_packet_twice_is_refused():
 
 
 def test_a_column_is_made_once_when_it_is_asked_for_and_integers_do_not_wrap():
-    buffer = pack("housekeeping", HOUSEKEEPING) + pack("detections", detections(2, np.random.default_rng(0)))
-    tables = tables_of(buffer)
+    tables = tables_of(pack("housekeeping", HOUSEKEEPING) + pack("detections", detections(2, np.random.default_rng(0))))
     assert set(tables) == {"housekeeping", "detections"}
     columns = tables["housekeeping"].columns
     assert list(columns) == [f.name for f in DICTIONARY.packet("housekeeping").fields]
@@ -512,8 +511,7 @@ def estimates_of(octets):
 
 @mark.parametrize("name, degrees", [("filter_state", -1), ("filter_estimate", 22)])
 def test_state_and_covariance_come_back_within_single_precision(name, degrees):
-    octets = b"".join(packet(name, row, 100 + row) for row in (0, 1))
-    found = estimates_of(octets)
+    found = estimates_of(b"".join(packet(name, row, 100 + row) for row in (0, 1)))
     assert found.image_ticks.tolist() == [100, 101] and found.packet_ticks.tolist() == [109, 110]
     assert found.frame_number.tolist() == [5, 6] and found.packet_index.tolist() == [0, 1]
     assert found.innovation_degrees.tolist() == [degrees, degrees]
@@ -524,8 +522,7 @@ def test_state_and_covariance_come_back_within_single_precision(name, degrees):
 
 def test_a_stream_may_hold_packets_of_both_versions_and_other_ones():
     other = DICTIONARY.pack("connection_report", {}, ticks=1, sequence_count=1)
-    octets = packet("filter_estimate", 0, 7) + other + packet("filter_state", 1, 8)
-    found = estimates_of(octets)
+    found = estimates_of(packet("filter_estimate", 0, 7) + other + packet("filter_state", 1, 8))
     assert dict(zip(found.image_ticks.tolist(), found.packet_index.tolist(), strict=True)) == {7: 0, 8: 2}
     assert len(estimates_of(other)) == 0 and estimates_of(other).covariance.shape == (0, 9, 9)
 

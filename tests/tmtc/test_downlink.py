@@ -125,8 +125,7 @@ def test_a_cadu_of_the_default_link_is_1279_octets_and_its_frame_what_spacepacke
     theirs = [TmTransferFrame.unpack(frame, 512, has_error_control_field=True) for frame in frames]
     assert [f.primary_header.vc_frame_count for f in theirs] == list(range(len(frames)))
     assert {f.primary_header.vc_id for f in theirs} == {2}
-    stream = b"".join(bytes(f.data_field) for f in theirs)
-    assert stream.startswith(b"".join(sent()[:40]))
+    assert b"".join(bytes(f.data_field) for f in theirs).startswith(b"".join(sent()[:40]))
 
 
 def test_bare_packets_are_recognised_an_empty_file_is_empty_and_long_packets_span_frames():
@@ -217,8 +216,7 @@ def test_frames_that_come_twice_or_late_are_not_lost_and_uncorrectable_ones_loca
     frames = [octets[k : k + 1279] for k in range(0, len(octets), 1279)]
     again = frames[:20] + frames[:10] + frames[20:40] + frames[5:15] + frames[40:]
     late = frames[:10] + frames[12:20] + frames[10:12] + frames[20:]
-    lost = [read(b"".join(one)).frames_lost for one in (again, late, late[:30] + late[33:] + late[:5])]
-    assert lost == [0, 0, 3]
+    assert [read(b"".join(one)).frames_lost for one in (again, late, late[:30] + late[33:] + late[:5])] == [0, 0, 3]
     octets = bytearray(cadus())
     octets[5 * 1279 + 10 : 5 * 1279 + 10 + 17 * 5 : 5] = bytes(17)
     decoded = read(bytes(octets))

@@ -97,12 +97,10 @@ def test_as_many_wrong_symbols_as_promised_are_repaired_and_counted_in_each_code
 
 def test_one_lost_codeword_does_not_hide_the_others():
     code = ReedSolomon()
-    frames = frames_for(code, 1)
-    blocks = encode(frames, code)
+    blocks = encode(frames_for(code, 1), code)
     blocks[0, 2 : 2 + 17 * 5 : 5] ^= 0x55  # seventeen errors in codeword 2
     blocks[0, 4] ^= 1  # one in codeword 4
-    result = decode(blocks, code)
-    assert result.corrected.tolist() == [[0, 0, UNCORRECTABLE, 0, 1]]
+    assert decode(blocks, code).corrected.tolist() == [[0, 0, UNCORRECTABLE, 0, 1]]
 
 
 def test_errors_found_in_the_virtual_fill_mean_that_too_many_others_were_there():

@@ -45,8 +45,7 @@ def test_a_stream_gives_all_its_packets_in_order_also_with_stray_octets():
     assert (cut.crc_errors, cut.octets_skipped, cut.octets_idle) == (0, 0, 0)
     cut = cut_packets(b"")
     assert len(cut) == 0 and cut.consumed == 0
-    octets = inserted(b"\x01\x02\x03")
-    cut = cut_to(octets, PACKETS)
+    cut = cut_to(inserted(b"\x01\x02\x03"), PACKETS)
     assert cut.skipped.tolist() == [[AT_500, AT_500 + 3]]
     assert cut.crc_errors == 0
 
@@ -56,8 +55,7 @@ def test_a_stream_gives_all_its_packets_in_order_also_with_stray_octets():
 
 @mark.parametrize("stray", [b"\x08\xa1\xc0", b"\x00" * 40, b"\xff" * 40, WHOLE[3:17], b"\x07\xff\xc0\x00\x00\x09"])
 def test_stray_octets_that_look_like_headers_cost_no_packet(stray):
-    octets = inserted(stray)
-    cut = cut_to(octets, PACKETS)
+    cut = cut_to(inserted(stray), PACKETS)
     assert cut.octets_skipped + cut.lengths[~cut.crc_ok].sum() + cut.octets_idle == len(stray)
 
 
@@ -106,9 +104,7 @@ def test_a_damaged_packet_that_holds_a_whole_packet_does_not_give_birth_to_it():
     )
     damaged = bytearray(outer)
     damaged[-5] ^= 1
-    octets = inserted(bytes(damaged))
-    cut = cut_to(octets, PACKETS)
-    assert cut.crc_errors == 1
+    assert cut_to(inserted(bytes(damaged)), PACKETS).crc_errors == 1
 
 
 def test_idle_packets_are_counted_and_not_given_and_those_of_the_other_type_are_none():
@@ -147,8 +143,7 @@ def test_segments_are_cut_each_for_itself_and_the_longest_packet_is_one():
     half = len(PACKETS[500]) // 2
     octets = WHOLE[: AT_500 + half] + WHOLE[AT_500 + half :]
     segments = np.array([[0, AT_500 + half], [AT_500 + half, len(octets)]], dtype=np.int64)
-    cut = cut_to(octets, PACKETS[:500] + PACKETS[501:], segments=segments)
-    assert cut.octets_skipped == len(PACKETS[500])
+    assert cut_to(octets, PACKETS[:500] + PACKETS[501:], segments=segments).octets_skipped == len(PACKETS[500])
     packet = append_crc(pack_packet(5, bytes(65_536), sequence_count=0)[:-2])
     assert len(packet) == 65_542
     cut_to(packet + packet, [packet, packet])
@@ -188,8 +183,7 @@ def injure(octets, injuries):
 @given(st.lists(INJURIES, max_size=6))
 def test_whatever_happens_no_whole_packet_is_lost_and_none_is_invented(injuries):
     packets = PACKETS[:40]
-    original = b"".join(packets)
-    octets, marks = injure(original, injuries)
+    octets, marks = injure(b"".join(packets), injuries)
     safe, at = [], 0
     for packet in packets:
         stop = at + len(packet)
@@ -249,8 +243,7 @@ def test_injured_streams_lose_no_whole_packet_and_invent_none(cases):
     good = set(zip(cut.offsets[cut.crc_ok].tolist(), cut.lengths[cut.crc_ok].tolist(), strict=True))
     assert set(expected) <= good
     # a damaged packet passes for a whole one at the checksum's own odds: some 200,000 of them, one in 65,536
-    invented = [at for at, length in good if bytes(buffer[at : at + length]) not in kinds]
-    assert len(invented) <= 10
+    assert len([at for at, length in good if bytes(buffer[at : at + length]) not in kinds]) <= 10
     assert int(cut.lengths.sum()) + cut.octets_skipped + cut.octets_idle == len(buffer)
 
 

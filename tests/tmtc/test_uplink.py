@@ -35,8 +35,7 @@ LONG = DICTIONARY.pack_command(
 def test_code_blocks_cltus_and_frames_are_those_of_the_standard():
     # a code block seen on other links: 22F600FF00421A with parity octet 12
     assert bch_parity(bytes.fromhex("22F600FF00421A")) == 0x12
-    cltu = encode_cltu(bytes.fromhex("22F600FF00421A"))
-    assert cltu == CLTU_START + bytes.fromhex("22F600FF00421A12") + CLTU_TAIL
+    assert encode_cltu(bytes.fromhex("22F600FF00421A")) == CLTU_START + bytes.fromhex("22F600FF00421A12") + CLTU_TAIL
     # the last block is filled with 55
     assert encode_cltu(b"\x01")[2:9] == b"\x01" + b"\x55" * 6
     # version 00, bypass 1, control 0, spare 00, spacecraft 76 | channel 2, length 9 - 1 | number 5
@@ -103,8 +102,7 @@ def test_sequence_controlled_frames_are_used_once_and_in_order():
 
 def test_a_number_far_off_locks_the_receiver_until_it_is_unlocked():
     decoder = UplinkDecoder(76)
-    encoder = UplinkEncoder(76, bypass=False, sequence_number=100)
-    far = encoder.encode(FIRST)
+    far = UplinkEncoder(76, bypass=False, sequence_number=100).encode(FIRST)
     assert decoder.decode(far).packets == ()
     assert decoder.farms[0].clcw.lockout
     assert decoder.decode(UplinkEncoder(76, bypass=False).encode(FIRST)).packets == ()
@@ -133,8 +131,7 @@ def test_packets_without_their_first_or_last_segment_are_dropped():
 
 
 def test_packets_are_cut_where_they_say_and_expedited_and_control_frames_counted():
-    segment = b"\xc0" + COMMANDS[0] + COMMANDS[1] + b"\x18\xa0"
-    frame = pack_tc_frame(TcFrame(76, 0, 0, segment, bypass=True))
+    frame = pack_tc_frame(TcFrame(76, 0, 0, b"\xc0" + COMMANDS[0] + COMMANDS[1] + b"\x18\xa0", bypass=True))
     decoded = UplinkDecoder(76, randomised=False).decode(encode_cltu(frame))
     assert list(decoded.packets) == COMMANDS[:2]
     assert decoded.faults == ("segment: expected a packet, found 2 octets",)
@@ -167,8 +164,7 @@ def test_whatever_the_link_does_no_command_is_invented(flips, cuts):
 @settings(max_examples=60, deadline=None)
 @given(st.binary(max_size=200))
 def test_any_octets_at_all_are_survived(octets):
-    decoded = UplinkDecoder(76).decode(octets + CLTU_START + octets)
-    assert decoded.octets_skipped <= 2 * len(octets) + 2
+    assert UplinkDecoder(76).decode(octets + CLTU_START + octets).octets_skipped <= 2 * len(octets) + 2
 
 
 @mark.parametrize(

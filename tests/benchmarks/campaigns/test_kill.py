@@ -17,8 +17,7 @@ SHORT = "--laptop --packets 400 --pieces 4 --reports 0 --pause 0.3 --json"
 
 def campaign(monkeypatch, capsys, words):
     monkeypatch.setattr(sys, "argv", ["kill", *words.split()])
-    code = main()
-    return code, json.loads(capsys.readouterr().out)
+    return main(), json.loads(capsys.readouterr().out)
 
 
 @mark.campaign
@@ -117,8 +116,7 @@ def test_a_second_hand_out_and_a_changed_answer_are_faults():
 def test_every_change_has_one_audit_entry_of_its_actor():
     record = record_of_clients()
     for number in range(len(LINES)):
-        missing = [line for k, line in enumerate(LINES) if k != number]
-        assert judge(record, ROWS, missing)["audit_wrong"] == 1
+        assert judge(record, ROWS, [line for k, line in enumerate(LINES) if k != number])["audit_wrong"] == 1
         assert judge(record, ROWS, [*LINES, LINES[number]])["audit_wrong"] == 1
         other = [replace(line, actor="eve") if k == number else line for k, line in enumerate(LINES)]
         assert judge(record, ROWS, other)["audit_wrong"] == (LINES[number].command != 4 or 1)

@@ -228,8 +228,7 @@ def test_processes_that_a_killed_run_has_left_are_ended_and_no_others(tmp_path):
 
 def test_a_database_server_continues_with_its_files(tmp_path):
     first = PostgresServer(tmp_path)
-    url = first.prepare_service()
-    assert "//service@" in url
+    assert "//service@" in first.prepare_service()
     first.part.kill()
     again = PostgresServer(tmp_path)
     try:

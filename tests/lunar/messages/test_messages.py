@@ -240,8 +240,7 @@ def standard_matrix(q1, q2, q3, qc):
 
 
 def test_quaternions_of_an_aem_are_those_of_the_standard():
-    text = format_aem((attitudes(),))
-    rows = text.partition("DATA_START\n")[2].partition("\nDATA_STOP")[0].splitlines()
+    rows = format_aem((attitudes(),)).partition("DATA_START\n")[2].partition("\nDATA_STOP")[0].splitlines()
     for row, q_wxyz in zip(rows, attitudes().q_wxyz, strict=True):
         numbers = [float(token) for token in row.split()[1:]]
         assert_allclose(standard_matrix(*numbers), matrix_from_quaternion(q_wxyz), atol=1e-11)
@@ -358,8 +357,7 @@ def test_a_horizons_table_is_read(tmp_path):
     segment = load_ephemeris(path).segments[0]
     assert segment.object_name == "LRO"
     # TDB is 69.184 s ahead of UTC, but for the 1.7 ms of its periodic part.
-    offset = from_tai_ns(segment.tai_ns, "TDB") - (START + np.array([0, 60]) * NS)
-    assert np.abs(offset).max() <= 1
+    assert np.abs(from_tai_ns(segment.tai_ns, "TDB") - (START + np.array([0, 60]) * NS)).max() <= 1
     assert_allclose(segment.position_m[0], [1.768e6, 0.0, -15e3])
     assert_allclose(segment.velocity_m_s[1], [110.0, 1500.0, 210.0])
 

@@ -123,8 +123,7 @@ def test_version_1_is_read_with_units_frame_bias_comments_and_useable_interval()
 
 
 def test_version_3_is_read_with_time_system_covariances_and_segments():
-    ephemeris = parse_oem(VERSION_3)
-    first, second = ephemeris.segments
+    first, second = parse_oem(VERSION_3).segments
     # TDB is ahead of UTC by 69.184 s; TDB - TT is some -0.9 ms in August.
     assert abs(int(first.utc_ns[0]) - START) < 2_000_000
     assert abs(int(first.utc_ns[0]) - START) > 100_000
@@ -138,8 +137,7 @@ def test_version_3_is_read_with_time_system_covariances_and_segments():
 
 
 def test_what_is_written_is_read_back_to_a_micrometre_with_everything_else_the_same():
-    covariance = Covariance(START, "RTN", np.diag([1.0, 4.0, 9.0, 1e-6, 4e-6, 9e-6]))
-    ephemeris = example_ephemeris(covariances=(covariance,))
+    ephemeris = example_ephemeris(covariances=(Covariance(START, "RTN", np.diag([1.0, 4.0, 9.0, 1e-6, 4e-6, 9e-6])),))
     back = parse_oem(format_oem(ephemeris))
     assert_same(back, ephemeris)
     for was, now in zip(ephemeris.segments, back.segments, strict=True):
@@ -324,8 +322,7 @@ def test_epochs_within_a_leap_second_that_have_no_place_are_refused_with_that_re
 
 @pytest.mark.parametrize("name", ["ICRS", "GCRF"])
 def test_other_names_of_icrf_axes_are_read(name):
-    found = parse_oem(VERSION_3.replace("REF_FRAME = ICRF", f"REF_FRAME = {name}", 1))
-    assert found.segments[0].frame == "ICRF"
+    assert parse_oem(VERSION_3.replace("REF_FRAME = ICRF", f"REF_FRAME = {name}", 1)).segments[0].frame == "ICRF"
 
 
 @pytest.mark.parametrize("fault", ["2029-13-07T00:00:00", "9noon"])

@@ -86,8 +86,7 @@ def test_spk_gives_the_states_of_the_ephemeris(tmp_path, interpolation, degree, 
 def test_spk_keeps_the_segments_and_their_useable_intervals(tmp_path):
     burn = START + 1800 * NS
     before = arc(0, 2400, useable_stop_utc_ns=burn)
-    after = segment_of(np.arange(1200, 3601, 60), 1e-3, useable_start_utc_ns=burn)
-    ephemeris = Ephemeris((before, after))
+    ephemeris = Ephemeris((before, segment_of(np.arange(1200, 3601, 60), 1e-3, useable_start_utc_ns=burn)))
     with kernels(tmp_path, orbit=spk_kernel(ephemeris, CRAFT).octets) as spice:
         for seconds_after in (-1, 1):
             epoch = burn + seconds_after * NS
@@ -186,8 +185,7 @@ def test_ck_clock_and_frame_turn_vectors_as_the_attitudes_do(tmp_path):
     utc_ns = START + np.arange(0, 600, 15) * NS
     ticks = ticks_from_utc_ns(utc_ns)
     rng = np.random.default_rng(3)
-    start = rng.normal(size=4)
-    q_wxyz = start + 0.01 * np.arange(len(ticks))[:, None] * rng.normal(size=4)
+    q_wxyz = rng.normal(size=4) + 0.01 * np.arange(len(ticks))[:, None] * rng.normal(size=4)
     q_wxyz /= np.linalg.norm(q_wxyz, axis=1, keepdims=True)
     q_wxyz[7] *= -1.0
     clock = format_sclk([ClockLine(int(ticks[0]) - 1000 * TICKS_PER_SECOND, START - 1000 * NS)], CRAFT)
@@ -228,8 +226,7 @@ def test_field_of_view_is_that_of_the_camera(tmp_path):
     assert (shape, frame, count) == ("POLYGON", "SELENITA_CAMERA", 4)
     assert_array_equal(boresight, [0.0, 0.0, 1.0])
     # 120 degrees between the edges of the image.
-    angle = np.degrees(np.arctan2(corners[:, 0], corners[:, 2]))
-    assert np.ptp(angle) == approx(120.0, abs=1e-9)
+    assert np.ptp(np.degrees(np.arctan2(corners[:, 0], corners[:, 2]))) == approx(120.0, abs=1e-9)
 
 
 def test_without_spiceypy_one_line_names_the_extra(monkeypatch):

@@ -53,8 +53,7 @@ def paper_orbit_mcmf_m(seconds):
 def place(position_m):
     """Return latitude, longitude, altitude."""
     radius = float(np.linalg.norm(position_m))
-    latitude = float(np.arcsin(position_m[2] / radius))
-    return latitude, float(np.arctan2(position_m[1], position_m[0])), radius - RADIUS_M
+    return float(np.arcsin(position_m[2] / radius)), float(np.arctan2(position_m[1], position_m[0])), radius - RADIUS_M
 
 
 def ticks_at(second):

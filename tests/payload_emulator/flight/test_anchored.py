@@ -148,8 +148,7 @@ def test_detections_with_numbers_that_are_none_are_passed_over_and_nothing_becom
     for values in named(packets, "filter_estimate"):
         assert np.all(np.isfinite(values["position_icrf_m"])) and np.all(np.isfinite(values["covariance"]))
     position = flight.rotations[-1] @ flight.states[-1, :3]
-    altitude_m = named(packets, "navigation_state")[-1]["altitude_m"]
-    assert altitude_m == approx(float(norm(position)) - 1_737_400.0, abs=60.0)
+    assert named(packets, "navigation_state")[-1]["altitude_m"] == approx(float(norm(position)) - 1_737_400.0, abs=60.0)
 
 
 @mark.parametrize("turn", ["mirrored", "rotated"])
@@ -200,8 +199,7 @@ def test_farther_than_any_widened_search_the_place_is_found_without_a_prior(navi
     # The part of the Moon about the track, so that a search takes moments.
     near = np.flatnonzero(np.abs(np.degrees(case.craters.latitude_rad) - about_deg(case)[0]) < 35.0)
     case = replace(case, craters=case.craters.select(near[turn_deg(case, near) < 25.0]))
-    lost = replace(PARAMETERS, lost_frames=10_000)
-    without = fly(replace(case, parameters=lost), 1)
+    without = fly(replace(case, parameters=replace(PARAMETERS, lost_frames=10_000)), 1)
     found = fly(replace(case, parameters=replace(PARAMETERS, lost=LostParameters())), 1)
     assert frames_until_back(without) == 999
     assert frames_until_back(found) <= 16
@@ -229,8 +227,7 @@ def turn_deg(case, rows):
 def test_a_stale_catalogue_misleads_nobody(navigation_case, wrong_share):
     errors = CatalogueErrors(wrong_share=wrong_share)
     # Without the search of the whole Moon, which takes a second a frame on this map.
-    parameters = replace(PARAMETERS, lost_frames=10_000)
-    run = fly(navigation_case(40, catalogue_errors=errors, parameters=parameters), 3)
+    run = fly(navigation_case(40, catalogue_errors=errors, parameters=replace(PARAMETERS, lost_frames=10_000)), 3)
     assert np.all(np.isfinite(run.error_rtn_m))
     late = slice(20, None)
     if wrong_share < 1.0:

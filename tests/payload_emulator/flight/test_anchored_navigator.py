@@ -336,8 +336,7 @@ def test_it_is_lost_beyond_its_limit(orbit):
     assert anchored.is_lost(unknown, parameters)
     # The report of a frame says so.
     navigator.state = wider
-    report = navigator.frame(1, None, None)
-    assert report.lost and not orbit.navigator().frame(1, None, None).lost
+    assert navigator.frame(1, None, None).lost and not orbit.navigator().frame(1, None, None).lost
 
 
 def test_a_wide_prior_is_searched_by_votes_and_says_so(orbit):
@@ -431,8 +430,7 @@ def test_a_widened_search_adds_the_distance_of_the_place_to_the_uncertainty(
     pose = orbit.pose(prior.mean[:3])
     away = replace(pose, position_icrf_m=pose.position_icrf_m + np.array([0.0, moved_m, 0.0]))
     none = np.empty(0, int)
-    place = Acquisition(none, none, away, 5, 3)
-    acquired = recorded(monkeypatch, recovery, "acquire", place)
+    acquired = recorded(monkeypatch, recovery, "acquire", Acquisition(none, none, away, 5, 3))
     corrected = []
     monkeypatch.setattr(recovery, "correct", lambda *given, **named: corrected.append((given, named)))
     parameters = navigator.setup.parameters
@@ -487,8 +485,7 @@ def test_a_reacquisition_leaves_out_the_pair_that_all_others_contradict(orbit, m
         assert correction._is_credible(prior, judged, limits) is credible
     # What a linear correction leaves of the velocity is added to its uncertainty.
     monkeypatch.setattr(correction, "curvature_m_s", lambda *_: 7.0)
-    bent = fix(count, found)
-    added = np.diag(bent.update.state.covariance - whole.update.state.covariance)
+    added = np.diag(fix(count, found).update.state.covariance - whole.update.state.covariance)
     assert_allclose(added[:6], [0.0, 0.0, 0.0, 49.0, 49.0, 49.0], rtol=1e-4)
 
 
@@ -550,8 +547,7 @@ def test_an_estimate_that_left_the_moon_starts_again_from_the_tables(orbit):
     below[:3] *= 0.9
     broken = FilterState(navigator.estimate.ticks, below, navigator.estimate.covariance, navigator.estimate.craters)
     navigator.state = replace(navigator.state, estimate=broken)
-    report = navigator.frame(3)
-    assert report.outcome is Outcome.fixed and orbit.error_m(navigator, 3) < 200.0
+    assert navigator.frame(3).outcome is Outcome.fixed and orbit.error_m(navigator, 3) < 200.0
 
 
 def test_disagreeing_frames_widen_the_search_and_then_give_the_prior_up(orbit, monkeypatch):
@@ -608,8 +604,7 @@ def test_what_identification_is_given_is_the_spread_of_prediction_and_catalogue(
     sighting = in_view(landmarks, pose, orbit.case.camera, 0.0)
     calls = recorded(monkeypatch, correction, "identify", "pairs")
     found = orbit.detections(2)
-    pairs = correction.associate(prior, sighting, found, landmarks, orbit.case.camera, parameters)
-    assert pairs == "pairs"
+    assert correction.associate(prior, sighting, found, landmarks, orbit.case.camera, parameters) == "pairs"
     ((given, seen, spread, own, variance, area_px2, rules, place),) = calls
     assert given is found and seen is sighting and rules is parameters.identification
     assert area_px2 == 512.0 * 512.0

@@ -59,8 +59,7 @@ def judged(evidence, monitor=None):
 @mark.parametrize("noise_deg", [0.01, 0.2, 1.0])
 @mark.parametrize("used_deg", [0.01, 1.0])
 def test_the_variance_of_the_attitude_is_estimated_without_bias(noise_deg, used_deg):
-    evidence = frames(3_000, np.radians(noise_deg), used_rad=np.radians(used_deg))
-    shown = frame_variances(tuple(evidence), FLOOR)
+    shown = frame_variances(tuple(frames(3_000, np.radians(noise_deg), used_rad=np.radians(used_deg))), FLOOR)
     # 3,000 frames; the best known axis counts most, so that the three count as one and a half.
     error = np.radians(0.25) ** 2 if noise_deg < 0.5 else np.radians(1.03) ** 2
     used = max(error, np.radians(used_deg) ** 2)
@@ -97,8 +96,7 @@ def test_a_sensor_as_declared_or_better_is_left_alone():
 def test_more_noise_is_detected_and_estimated(noise_deg, within):
     for seed in range(10):
         after = judged(frames(60, DECLARED, seed) + frames(40, np.radians(noise_deg), seed + 100))
-        first = next(k for k, one in enumerate(after) if one.degraded)
-        assert 60 <= first < 60 + within
+        assert 60 <= next(k for k, one in enumerate(after) if one.degraded) < 60 + within
         # The mean of 24 frames is known to a quarter, and one standard error is added.
         assert 0.8 < after[-1].noise_rad / np.radians(noise_deg) < 1.6
         assert after[-1].sigma_rad(DECLARED) == after[-1].noise_rad
@@ -154,8 +152,7 @@ def test_a_bad_sensor_is_detected_and_tolerated_on_passes(navigation_case, monke
         assert np.median(run.error_m[20:]) < 250.0 and run.error_m[20:].max() < 500.0
     # One run is one independent draw of six degrees of freedom: three of them exceed 11 once in a thousand.
     assert np.mean([run.nees[20:].mean() for run in runs]) < 11.0
-    without = flown(navigation_case, 31, 1.0, watched=False)
-    assert without.nees[20:].mean() > 30.0
+    assert flown(navigation_case, 31, 1.0, watched=False).nees[20:].mean() > 30.0
 
 
 def test_moderate_noise_is_detected_within_a_window_of_frames(navigation_case):
@@ -183,8 +180,7 @@ def test_a_degraded_attitude_takes_back_the_fixes_of_the_window_and_counts_with_
     before = state.estimate
     # The estimate goes back to the oldest prediction that the window still has, here one without any error.
     exact = replace(before, mean=before.mean + 1.0, covariance=2.0 * before.covariance)
-    later = replace(exact, ticks=int(ticks[1]))
-    full = (exact, *[later] * (setup.parameters.monitor.window_frames - 1))
+    full = (exact, *[replace(exact, ticks=int(ticks[1]))] * (setup.parameters.monitor.window_frames - 1))
     watching = replace(state, trusted=full, attitude=AttitudeMonitor(window=tuple(frames(24, 0.0))))
     back = anchored.with_judged_attitude(watching, degraded, None, setup)
     assert_allclose(back.estimate.mean, exact.mean, rtol=1e-6)

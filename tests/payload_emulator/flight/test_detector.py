@@ -132,8 +132,7 @@ def test_the_shipped_network_is_small_and_tells_what_it_is(detector):
     assert 0.1 <= detector.score_threshold <= 0.9
     for key in ("input", "outputs", "navigation_threshold", "data", "validation", "git_revision", "training_seed"):
         assert detector.metadata[key]
-    tested = json.loads(detector.metadata["test_figures"])
-    assert set(tested) == {"real-strip", "real-block", "procedural-world"}
+    assert set(json.loads(detector.metadata["test_figures"])) == {"real-strip", "real-block", "procedural-world"}
 
 
 def test_a_network_of_another_hash_and_octets_that_are_none_are_refused():
@@ -163,8 +162,7 @@ def maps(*count):
 
 
 def test_a_flat_heatmap_gives_no_detections():
-    found = decode(maps(), maps(4), 0.1)
-    assert len(found) == 0
+    assert len(decode(maps(), maps(4), 0.1)) == 0
 
 
 def detections(u, v, diameter=40.0, ratio=None):
@@ -208,8 +206,7 @@ def test_craters_on_the_very_edge_of_the_heatmap_are_decoded():
 def test_a_weaker_repetition_is_dropped_and_a_nested_crater_and_what_it_repeats_stay():
     columns = ([100, 104, 102], [100, 101, 100], [40, 44, 12], [0.9, 0.8, 0.7], [1, 1, 1])
     found = Detections(*(np.array(column, float) for column in columns))
-    kept = drop_duplicates(found, DetectorParameters())
-    assert kept.diameter_px.tolist() == [40, 12]
+    assert drop_duplicates(found, DetectorParameters()).diameter_px.tolist() == [40, 12]
     # The second repeats the first and goes; the third repeats only the second, so it is a crater of its own.
     found = detections([100, 108, 116], [100, 100, 100], diameter=30.0)
     assert drop_duplicates(found, DetectorParameters()).u_px.tolist() == [100, 116]
@@ -259,8 +256,7 @@ def test_a_picture_without_its_sun_gives_what_the_picture_with_it_gives(detector
     assert found.detections.u_px.tolist() == given.detections.u_px.tolist()
     assert found.detections.score.tolist() == given.detections.score.tolist()
     assert len(found.detections) >= len(BOWL_CENTRES)
-    straight = detector.examine_any_size(image, sun_at_azimuth(200.0))[1]
-    assert straight.v_px.tolist() == given.detections.v_px.tolist()
+    assert detector.examine_any_size(image, sun_at_azimuth(200.0))[1].v_px.tolist() == given.detections.v_px.tolist()
 
 
 def test_craters_of_two_opposite_suns_leave_it_undetermined(detector):
@@ -276,8 +272,7 @@ def test_a_slope_is_no_evidence_of_a_crater():
 
 
 def test_nothing_to_be_seen_gives_no_sun_and_a_dark_picture_is_a_verdict(detector):
-    noise = np.random.default_rng(3).integers(90, 110, (300, 400)).astype(np.uint8)
-    outcome = search_picture(detector, noise)
+    outcome = search_picture(detector, np.random.default_rng(3).integers(90, 110, (300, 400)).astype(np.uint8))
     assert outcome.quality is ImageQuality.OK
     assert outcome.sun is None
     outcome = search_picture(detector, np.zeros((64, 64), np.uint8))
@@ -297,8 +292,7 @@ def test_craters_of_eight_pixels_are_found_at_two_scales(detector):
     two = search_picture(detector, image, sun_at_azimuth(0.0), two_scales=True)
     assert found_share(two) > 0.9
     assert found_share(one) < 0.3
-    near = two.detections.select(two.detections.score > 0.44)
-    assert np.median(near.diameter_px) == approx(8.0, rel=0.25)
+    assert np.median(two.detections.select(two.detections.score > 0.44).diameter_px) == approx(8.0, rel=0.25)
 
 
 def test_what_one_scale_finds_two_scales_find(detector):
@@ -346,8 +340,7 @@ def test_many_detections_lose_the_same_duplicates_as_few(monkeypatch, seed):
     each_with_each = drop_duplicates(found, DetectorParameters())
     assert len(each_with_each) < len(found)
     monkeypatch.setattr("payload_emulator.flight.vision.detector.MANY_DETECTIONS", 0)
-    by_neighbours = drop_duplicates(found, DetectorParameters())
-    assert by_neighbours.u_px.tolist() == each_with_each.u_px.tolist()
+    assert drop_duplicates(found, DetectorParameters()).u_px.tolist() == each_with_each.u_px.tolist()
 
 
 def test_memory_does_not_grow_with_the_square_of_the_detections():

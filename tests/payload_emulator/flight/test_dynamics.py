@@ -52,8 +52,7 @@ def test_an_orbit_on_board_is_that_of_the_library_to_a_centimetre_and_ends_where
     assert_allclose(predicted.state[3:6], expected[3:], atol=1e-5)
     orbit, state = model(), start_state()
     there = orbit.propagate(state, START, START + 1_800 * 65_536)
-    back = orbit.propagate(there.state, START + 1_800 * 65_536, START)
-    assert_allclose(back.state[:6], state[:6], atol=1e-3)
+    assert_allclose(orbit.propagate(there.state, START + 1_800 * 65_536, START).state[:6], state[:6], atol=1e-3)
 
 
 @mark.parametrize("axis, step", [(0, 10.0), (2, 10.0), (4, 0.01), (6, 1e-6), (8, 1e-6)])
@@ -99,8 +98,7 @@ POLAR_M_S = np.array([0.0, 0.0, 1_665.0])
 
 
 def test_noise_falls_with_altitude_and_differs_by_side():
-    noise = ProcessNoise((4e-7, 2e-7, 1e-7), (1e-12,) * 3, 900.0, (9e-7, 9e-7, 9e-7), 8_000.0, 30_000.0)
-    orbit = model(noise)
+    orbit = model(ProcessNoise((4e-7, 2e-7, 1e-7), (1e-12,) * 3, 900.0, (9e-7, 9e-7, 9e-7), 8_000.0, 30_000.0))
 
     def density(altitude_m, longitude_deg):
         radius = 1_737_400.0 + altitude_m
@@ -129,8 +127,7 @@ def test_noise_over_the_far_side_grows_with_the_cosine_of_the_inclination(inclin
     share = abs(np.cos(inclination))
     found = model(noise)._white_psd(np.array([-1_768e3, 0.0, 0.0]), velocity)
     assert_allclose(found, [3e-6 + share * 8e-6, 2e-6, 1e-6 + share * 6e-6], rtol=1e-9)
-    near = model(noise)._white_psd(np.array([1_768e3, 0.0, 0.0]), velocity)
-    assert near == (4e-7, 2e-7, 1e-7)
+    assert model(noise)._white_psd(np.array([1_768e3, 0.0, 0.0]), velocity) == (4e-7, 2e-7, 1e-7)
 
 
 def test_the_noise_that_the_filter_adds_is_that_of_its_inclination():

@@ -210,8 +210,7 @@ def test_packets_damaged_in_the_store_are_found_reported_and_never_sent(observin
 def test_a_clock_that_jumps_is_reported_and_housekeeping_begins_again(observing, jump_s):
     observing.skew_ticks += round(jump_s * 65_536)
     packets = observing.step()
-    jumps = [v["value_1"] for v in observing.named(packets, "event_medium")]
-    assert jumps == [approx(jump_s, abs=1e-3)]
+    assert [v["value_1"] for v in observing.named(packets, "event_medium")] == [approx(jump_s, abs=1e-3)]
     assert observing.named(packets, "housekeeping")[0]["clock_status"] == 2
     assert len(observing.named(observing.step(), "detections")) == 1
 

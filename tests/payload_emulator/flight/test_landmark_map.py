@@ -145,8 +145,7 @@ def test_the_intersection_never_claims_more_than_the_better_of_two_equal_directi
     joined = intersected(first, second)
     assert np.allclose(joined.covariance_m2, covariance)
     assert (joined.sightings, joined.passes) == (6, 2)
-    turned = replace(second, covariance_m2=np.diag([900.0, 400.0, 100.0]))
-    other = intersected(first, turned)
+    other = intersected(first, replace(second, covariance_m2=np.diag([900.0, 400.0, 100.0])))
     assert np.trace(other.covariance_m2) <= np.trace(covariance)
     # Julier and Uhlmann: for diag(100, 900) and diag(900, 100) the half and half mixture gives 2/(1/100+1/900) = 180.
     assert np.diag(other.covariance_m2)[[0, 2]] == approx([180.0, 180.0])
@@ -161,8 +160,7 @@ def test_memory_is_bounded():
 
 def test_landmarks_complement_the_catalogue_with_identities_of_their_own():
     mapper = Mapper()
-    craters = ground(25, 1)
-    fly(mapper, craters, 2)
+    fly(mapper, ground(25, 1), 2)
     one = np.ones(1)
     catalogue = CatalogueTable(np.array([7]), 0.1 * one, 0.2 * one, 6e3 * one, 50.0 * one, 80.0 * np.ones((1, 3)))
     merged = with_catalogue(mapper.state.landmarks, catalogue)
@@ -176,8 +174,7 @@ def test_landmarks_complement_the_catalogue_with_identities_of_their_own():
 
 
 def test_nothing_is_mapped_while_the_spacecraft_does_not_know_where_it_is_or_sees_nothing():
-    mapper = Mapper(position_limit_m=50.0)
-    assert fly(mapper, ground(25, 1), 2) == []
+    assert fly(Mapper(position_limit_m=50.0), ground(25, 1), 2) == []
     nothing = no_detections()
     place = mcmf_from_spherical(0.0, 0.0, 30e3)
     view = View(0, nadir_camera_from_mcmf(place), place, np.eye(3), 1e-4)
@@ -193,8 +190,7 @@ def test_detections_that_are_no_numbers_or_on_a_catalogued_crater_are_not_free()
     place = mcmf_from_spherical(0.0, 0.0, 30e3)
     view = View(0, nadir_camera_from_mcmf(place), place, np.eye(3), 1e-4)
     values = np.array([np.nan, 200.0, 300.0])
-    size = np.array([20.0, np.nan, 25.0])
-    found = Detections(values, values, size, np.ones(3), np.ones(3))
+    found = Detections(values, values, np.array([20.0, np.nan, 25.0]), np.ones(3), np.ones(3))
     for k in range(4):
         mapper.observe(replace(view, ticks=k * SECOND), found, np.ones(3), np.ones(3, bool), 0.0)
     assert len(mapper.close()) == 1

@@ -127,8 +127,7 @@ def test_false_detections_mirrored_and_turned_images_find_no_place(index):
 
 
 def test_a_place_off_the_map_few_detections_and_those_that_are_no_numbers_are_no_fix(index):
-    other = craters(west_deg=100.0, seed=8)
-    _, found = frame(other, 0.0, 110.0, 30e3, seed=2)
+    _, found = frame(craters(west_deg=100.0, seed=8), 0.0, 110.0, 30e3, seed=2)
     assert searched(found, index) is None
     assert searched(no_detections(), index) is None
     _, found = frame(index.landmarks, 3.0, 359.7, 30e3, seed=5)
@@ -211,8 +210,7 @@ def test_a_camera_beyond_the_last_craters_is_found(beyond_deg, index):
     latitude = np.degrees(index.landmarks.latitude_rad)
     edge = latitude.min() if beyond_deg < 0.0 else latitude.max()
     place, found = frame(index.landmarks, edge + beyond_deg, 1.0, 45e3, seed=3, recall=0.9, false=1)
-    result = searched(found, index)
-    assert norm(result.position_mcmf_m - place) < 2_000.0
+    assert norm(searched(found, index).position_mcmf_m - place) < 2_000.0
 
 
 IMAGE = Image(100.0, np.array([50.0, 50.0]), np.array([50.0, 50.0]))
@@ -366,8 +364,7 @@ def test_longitudes_on_either_side_of_the_meridian_survive_packing():
 def test_gravity_orientation_and_initial_state_come_back_exactly():
     rng = np.random.default_rng(3)
     lower = np.tril(rng.normal(size=(9, 9)))
-    gravity = GravityTable("TEST8", 4.9e12, 1.738e6, lower, 2.0 * lower)
-    again = unpack_gravity_table(pack_gravity_table(gravity))
+    again = unpack_gravity_table(pack_gravity_table(GravityTable("TEST8", 4.9e12, 1.738e6, lower, 2.0 * lower)))
     assert (again.name, again.gm_m3_s2, again.radius_m) == ("TEST8", 4.9e12, 1.738e6)
     assert_array_equal(again.c_bar, lower)
     assert_array_equal(again.s_bar, 2.0 * lower)
@@ -383,13 +380,11 @@ def test_an_orientation_table_of_two_hour_steps_is_a_rotation_good_to_a_millimet
         # A turning Moon with a physical libration of 0.01 rad and 27 days: rates as large as the real ones.
         w, tilt = 2.6617e-6 * second, 0.4 + 1e-2 * np.sin(2.6617e-6 * second)
         rz = np.array([[np.cos(w), np.sin(w), 0], [-np.sin(w), np.cos(w), 0], [0, 0, 1]])
-        rx = np.array([[1, 0, 0], [0, np.cos(tilt), np.sin(tilt)], [0, -np.sin(tilt), np.cos(tilt)]])
-        return rz @ rx
+        return rz @ np.array([[1, 0, 0], [0, np.cos(tilt), np.sin(tilt)], [0, -np.sin(tilt), np.cos(tilt)]])
 
     seconds = np.arange(-36_000.0, 122_400.0, 7_200.0)
     ticks = np.round(seconds * 65_536).astype(int)
-    octets = pack_orientation_table(ticks, [matrix(second) for second in seconds], np.eye(3))
-    table = unpack_orientation_table(octets)
+    table = unpack_orientation_table(pack_orientation_table(ticks, [matrix(second) for second in seconds], np.eye(3)))
     for second in (0.0, 1_234.0, 50_000.0):
         found = table.at(round(second * 65_536))
         assert_allclose(found @ found.T, np.eye(3), atol=1e-14)

@@ -172,8 +172,7 @@ def test_an_update_is_the_least_squares_solution_with_its_covariance():
     assert found.state.ticks == prior.ticks
     # Each sighting against the update with the others alone: its own variance is as good as infinite there.
     for k in range(index.size):
-        alone = np.where(np.arange(index.size) == k, 1e12, variance)
-        x, p, _, _ = dense_update(prior, landmarks, index, uv, alone)
+        x, p, _, _ = dense_update(prior, landmarks, index, uv, np.where(np.arange(index.size) == k, 1e12, variance))
         design = np.empty((2, x.size))
         for column in range(x.size):
             width = np.sqrt(p[column, column]) * 0.1
@@ -219,8 +218,7 @@ def test_what_all_craters_share_is_distinguished_from_the_position_by_its_prior_
 def test_craters_seen_where_they_are_predicted_move_nothing_and_tell_much():
     landmarks, index = craters(), np.arange(7)
     prior = prior_state(index)
-    uv = projected(prior.mean, landmarks, index, np.zeros(3))
-    found = updated(prior, landmarks, index, uv, np.full(7, 0.5))
+    found = updated(prior, landmarks, index, projected(prior.mean, landmarks, index, np.zeros(3)), np.full(7, 0.5))
     assert_allclose(found.state.mean, prior.mean, atol=1e-5)
     assert found.nis == approx(0.0, abs=1e-9)
     assert np.all(np.diag(found.state.covariance) <= np.diag(prior.covariance) * (1.0 + 1e-9))
@@ -249,8 +247,7 @@ def test_derivatives_stand_in_the_columns_of_their_states():
     assert design.shape == (3, 2, size)
 
     def measured(x):
-        full = np.concatenate([x[:18], x[21:24], x[18:21], x[14:17]])
-        return projected(full, landmarks, asked, x[24:])
+        return projected(np.concatenate([x[:18], x[21:24], x[18:21], x[14:17]]), landmarks, asked, x[24:])
 
     steps = differences(24)
     for k in range(size):
@@ -289,8 +286,7 @@ def test_a_prediction_carries_each_part_by_its_own_law():
     # What the registration leaves is lost with the angle flown, at a memory of 30 degrees.
     there = model.propagate(prior.mean[:9], prior.ticks, 1_300 * SECOND).state[:3]
     here = prior.mean[:3]
-    angle = np.arccos(here @ there / norm(here) / norm(there))
-    place = np.exp(-angle / np.radians(30.0))
+    place = np.exp(-np.arccos(here @ there / norm(here) / norm(there)) / np.radians(30.0))
     assert 0.1 < place < 0.95
     transition[14:17, 14:17] = place * np.eye(3)
     noise = np.zeros((24, 24))
@@ -375,8 +371,7 @@ def test_craters_come_and_go_with_their_correlations():
     turned = prior.with_craters(kalman.TURN, np.ones((1, 3)))
     assert not turned.covariance[27:, :27].any() and not turned.mean[27:].any()
     assert prior.with_craters(np.array([4]), np.ones((1, 3))) is prior
-    none = first_state()
-    assert none.slots(np.array([3])).tolist() == [-1]
+    assert first_state().slots(np.array([3])).tolist() == [-1]
 
 
 def test_joseph_form_holds_for_a_gain_that_is_not_optimal():
@@ -456,8 +451,7 @@ def test_burns_at_one_time_negative_sigmas_and_nan_are_refused(count, kick, sigm
 
 def test_a_burn_is_flown_at_its_time_and_not_before(model):
     state, stop = start_state(), START + 900 * SECOND
-    half = model.propagate(state, START, START + 600 * SECOND)
-    kicked = half.state.copy()
+    kicked = model.propagate(state, START, START + 600 * SECOND).state.copy()
     kicked[3:6] += KICK
     rest = model.propagate(kicked, START + 600 * SECOND, stop)
     assert_array_equal(flown(model, state, START, stop, TABLE), rest.state)

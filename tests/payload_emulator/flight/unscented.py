@@ -22,8 +22,7 @@ _H = np.sqrt(3.0)
 
 def _differences(centre, plus, minus):
     """Return mean (m,) of a function, and its first and second differences (m, n), from its values at the points."""
-    count = plus.shape[0]
-    mean = (_H**2 - count) / _H**2 * centre + (plus + minus).sum(axis=0) / (2.0 * _H**2)
+    mean = (_H**2 - plus.shape[0]) / _H**2 * centre + (plus + minus).sum(axis=0) / (2.0 * _H**2)
     second = np.sqrt(_H**2 - 1.0) / (2.0 * _H**2) * (plus + minus - 2.0 * centre)
     return mean, (plus - minus).T / (2.0 * _H), second.T
 

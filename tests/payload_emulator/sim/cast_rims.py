@@ -48,8 +48,7 @@ def rim_errors(terrain, camera, position_mcmf_m, camera_from_mcmf):
     uv = expected
     for _ in range(ROUNDS):
         hit = cast(terrain, camera, position, rotation, uv.reshape(-1, 2)).reshape(*latitude.shape, 3)
-        height = spherical_from_mcmf(hit)[2]
-        rim = mcmf_from_spherical(latitude, longitude, height)
+        rim = mcmf_from_spherical(latitude, longitude, spherical_from_mcmf(hit)[2])
         miss = np.linalg.norm(hit - rim, axis=-1)
         uv = np.where((miss > FOUND_M)[..., None], project_mcmf(camera, rotation, position, rim), uv)
     found = miss <= FOUND_M

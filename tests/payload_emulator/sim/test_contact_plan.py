@@ -32,8 +32,7 @@ def ephemeris():
     rate = 2.0 * np.pi / 6_672.0
     position = 1.768e6 * (np.cos(angle)[:, None] * first + np.sin(angle)[:, None] * second)
     velocity = 1.768e6 * rate * (-np.sin(angle)[:, None] * first + np.cos(angle)[:, None] * second)
-    segment = EphemerisSegment(times, position, velocity, object_name="A", object_id="A", degree=7)
-    return Ephemeris((segment,))
+    return Ephemeris((EphemerisSegment(times, position, velocity, object_name="A", object_id="A", degree=7),))
 
 
 def elevation_deg(ephemeris, utc_ns, station):
@@ -53,8 +52,7 @@ def elevation_deg(ephemeris, utc_ns, station):
 
 @mark.parametrize("station", ["goldstone", "canberra"])
 def test_contacts_are_where_pymap3d_sees_the_spacecraft_above_the_lowest_elevation(ephemeris, station):
-    section = LinkSection(stations=(station,))
-    plan = plan_contacts(ephemeris, section, START, STOP)
+    plan = plan_contacts(ephemeris, LinkSection(stations=(station,)), START, STOP)
     assert plan
     inside = np.zeros(1440, bool)
     minutes = START + np.arange(1440) * 60 * NS
@@ -88,8 +86,7 @@ def test_one_station_at_a_time_has_the_contact_at_the_light_time_of_its_range_cu
     contact = plan_contacts(ephemeris, LinkSection(stations=("madrid",)), START, STOP)[0]
     utc_ns = contact.start_utc_ns + 137 * NS
     position = ephemeris.at(np.array([utc_ns]))[0][0]
-    earth = np.asarray(earth_position_icrf_m(float(tdb_s_from_utc_ns(utc_ns))))
-    centre_s = norm(position - earth) / SPEED_OF_LIGHT_M_S
+    centre_s = norm(position - np.asarray(earth_position_icrf_m(float(tdb_s_from_utc_ns(utc_ns))))) / SPEED_OF_LIGHT_M_S
     # At elevation e the station is R sin(e) nearer than the centre of the Earth: here near 10 deg.
     expected = centre_s - 6.371e6 * np.sin(np.radians(elevation_deg(ephemeris, utc_ns, "madrid"))) / SPEED_OF_LIGHT_M_S
     assert contact.light_s(utc_ns) == approx(expected, abs=3e-4)

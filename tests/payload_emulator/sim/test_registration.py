@@ -71,15 +71,13 @@ def test_many_rims_give_the_shift_few_are_not_believed_and_none_change_nothing()
     assert FLOOR_SIGMA_M <= sigma < 20.0
     shift, sigma = middle(fit_registration(rims(2, (300.0, 0.0), 400.0)))
     assert 0.0 <= shift[0] < 30.0 and sigma > 0.95 * PROCESS_SIGMA_M
-    far = fit_registration(rims(50, (30.0, 0.0), 60.0))
-    away, unknown = far.at(np.radians([-50.0]), np.radians([100.0]))
+    away, unknown = fit_registration(rims(50, (30.0, 0.0), 60.0)).at(np.radians([-50.0]), np.radians([100.0]))
     assert away.tolist() == [[0.0, 0.0]] and np.isnan(unknown).all()
 
 
 def test_wrong_rims_do_not_move_the_shift_and_its_uncertainty_is_that_of_the_errors():
     good = rims(400, (-30.0, 70.0), 60.0)
-    wrong = np.arange(400) % 10 == 3
-    spoilt = replace(good, north_m=np.where(wrong, 1_500.0, good.north_m))
+    spoilt = replace(good, north_m=np.where(np.arange(400) % 10 == 3, 1_500.0, good.north_m))
     clean, _ = middle(fit_registration(good))
     robust, _ = middle(fit_registration(spoilt))
     # A mean would move by 143 m.
@@ -111,8 +109,7 @@ def test_a_catalogue_is_moved_by_its_place_also_over_the_zero_meridian():
     craters = make_catalogue(np.radians([3.0, 3.0]), np.radians([358.0, 2.0]), [5e3, 6e3], source="x")
     moved = registered(craters, registration)
     assert (moved.latitude_rad - craters.latitude_rad) * RADIUS_M == approx([-20.0, -20.0])
-    east = (moved.longitude_rad - craters.longitude_rad) * RADIUS_M * cos(radians(3.0))
-    assert east == approx([50.0, 50.0])
+    assert (moved.longitude_rad - craters.longitude_rad) * RADIUS_M * cos(radians(3.0)) == approx([50.0, 50.0])
     assert registered(craters, None) is craters
 
 
@@ -164,8 +161,7 @@ def folder_of(root, *others):
     raster = write_raster(root / "dem/flat_128ppd_000E_+15.tif", 10.0, 20.0, 8.0, lambda lat, _: 0.0 * lat)
     catalogue = root / "craters.csv"
     latitude, longitude, size_m = np.concatenate([[[15.0], [14.0], [8e3]], *others], axis=1)
-    listed = make_catalogue(np.radians(latitude), np.radians(longitude), size_m, source="x")
-    save_catalogue(listed, catalogue)
+    save_catalogue(make_catalogue(np.radians(latitude), np.radians(longitude), size_m, source="x"), catalogue)
     made = rims(100, (-30.0, 70.0), 60.0)
     made = replace(made, longitude_rad=made.longitude_rad - radians(286.0))
     save_registration(
@@ -179,8 +175,7 @@ def test_terrain_is_opened_with_its_catalogue_registered(tmp_path):
     data = folder_of(tmp_path)
     terrain = open_terrain("raster", data, 1)
     assert terrain.registration is not None
-    north_m = (terrain.catalogue.latitude_rad[0] - radians(15.0)) * RADIUS_M
-    assert north_m == approx(70.0, abs=15.0)
+    assert (terrain.catalogue.latitude_rad[0] - radians(15.0)) * RADIUS_M == approx(70.0, abs=15.0)
     (tmp_path / PRODUCT).unlink()
     plain = open_terrain("raster", data, 1)
     assert plain.registration is None
@@ -213,8 +208,7 @@ def test_ground_without_a_product_is_registered_from_its_rims(tmp_path):
     field = Field()
     heights, top, left = field.window(10.0, 16.0, 300.0, 306.0)
     listed = field.listed(40.0)
-    places = np.degrees([listed.latitude_rad, listed.longitude_rad])
-    data = folder_of(tmp_path, [*places, listed.diameter_m])
+    data = folder_of(tmp_path, [*np.degrees([listed.latitude_rad, listed.longitude_rad]), listed.diameter_m])
 
     def drawn(latitude_deg, longitude_deg):
         rows, columns = np.rint((top - latitude_deg) * 128.0), np.rint((longitude_deg - left) * 128.0)
@@ -228,8 +222,7 @@ def test_ground_without_a_product_is_registered_from_its_rims(tmp_path):
         return SimpleNamespace(positions_mcmf=lambda utc_ns: place)
 
     times = np.zeros(1, int)
-    stated = _registration_name(terrain, beneath(13.0, 303.0), times)
-    assert stated == ("crater list not registered to the terrain",)
+    assert _registration_name(terrain, beneath(13.0, 303.0), times) == ("crater list not registered to the terrain",)
     _register(terrain, beneath(13.0, 303.0), times)
     shift, sigma = terrain.registration.at(np.radians([13.0, 15.0]), np.radians([303.0, 14.0]))
     assert shift[0] == approx(OFFSET_M, abs=20.0) and shift[1, 1] == approx(70.0, abs=15.0)
@@ -418,8 +411,7 @@ def test_a_kidnap_moves_by_its_distance_on_the_sphere_and_keeps_the_shape_of_the
     before = np.concatenate([part[0] for part in truth.states(JUMP)])
     after = turned_state(before, 20e3, heading_rad)
     radius = norm(before[:3])
-    angle = np.arccos(before[:3] @ after[:3] / radius**2)
-    assert radius * angle == approx(20e3, rel=1e-6)
+    assert radius * np.arccos(before[:3] @ after[:3] / radius**2) == approx(20e3, rel=1e-6)
     assert norm(after[:3]) == approx(radius, rel=1e-12)
     assert after[:3] @ after[3:] == approx(before[:3] @ before[3:], abs=1e-3)
 
@@ -444,8 +436,7 @@ def test_plans_differ_from_burns_by_the_declared_share():
     assert_allclose([burn.sigma_m_s for burn in burns], 0.1, rtol=1e-12)
     # 1,200 draws: the standard deviation is known to 2 %.
     assert errors.std() == approx(0.1, rel=0.1)
-    again = executed(EPOCH, done, 0.02, (1, 2))
-    assert_array_equal(again.planned_m_s, burns[0].planned_m_s)
+    assert_array_equal(executed(EPOCH, done, 0.02, (1, 2)).planned_m_s, burns[0].planned_m_s)
 
 
 def test_a_scenario_cannot_move_the_spacecraft_and_maintain_its_orbit_at_once():

@@ -127,14 +127,12 @@ def test_crossings_outside_the_longitudes_are_not_observable_and_bands_lie_on_on
 
 def test_the_attitude_message_carries_attitude_and_sun_and_an_error_turns_the_camera_by_its_size():
     camera_from_mcmf = nadir_camera_from_mcmf(np.array([RADIUS_M, 0.0, 0.0]))
-    sun_mcmf = np.array([0.6, 0.0, 0.8])
-    message = attitude_message(camera_from_mcmf, camera_from_mcmf @ sun_mcmf)
+    message = attitude_message(camera_from_mcmf, camera_from_mcmf @ np.array([0.6, 0.0, 0.8]))
     assert_allclose(matrix_from_quaternion(message[:4]), camera_from_mcmf, atol=1e-12)
     # Camera: x east, y south, z down. The Sun stands 0.6 up and 0.8 north.
     assert_allclose(message[4:], [0.0, -0.8, -0.6], atol=1e-12)
     camera = nadir_camera_from_mcmf(np.array([RADIUS_M, 0.0, 0.0]))
-    turned = perturbed(camera, np.array([0.0, np.radians(2.0), 0.0]))
-    angle = np.arccos((np.trace(turned @ camera.T) - 1.0) / 2.0)
+    angle = np.arccos((np.trace(perturbed(camera, np.array([0.0, np.radians(2.0), 0.0])) @ camera.T) - 1.0) / 2.0)
     assert np.degrees(angle) == approx(2.0)
     assert perturbed(camera, np.zeros(3)) is camera
 

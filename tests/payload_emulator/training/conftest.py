@@ -38,8 +38,7 @@ def draw_blobs(rng, u, v, diameter, pits=()):
 
 def write_blob_dataset(folder, frames_per_split, seed=3, pits=()):
     """A data set of blobs in the project's own format, 30 km up over a plain; pits have no labels."""
-    sources = tuple(Source(name, name, "procedural", 1.0) for name in frames_per_split)
-    recipe = Recipe("blobs", seed, sources)
+    recipe = Recipe("blobs", seed, tuple(Source(name, name, "procedural", 1.0) for name in frames_per_split))
     for name in ("images", "metadata", "shards"):
         (folder / name).mkdir(parents=True)
     hashes, number = {}, 0

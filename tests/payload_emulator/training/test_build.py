@@ -115,8 +115,7 @@ def test_a_build_killed_at_work_goes_on_to_the_same_bytes(built, tmp_path):
             time.sleep(0.02)
         first.kill()
     (target / "images" / ".000002.png.4711").write_bytes(b"half a picture")
-    done = len(list(target.glob("shards/*.npz")))
-    assert 1 <= done < 4
+    assert 1 <= len(list(target.glob("shards/*.npz"))) < 4
     list(build(load_recipe(recipe), target, 3, find_data(None)))
     assert check(target) == []
     ours, theirs = ({p.relative_to(f): p.read_bytes() for p in f.rglob("*") if p.is_file()} for f in (built, target))
@@ -179,8 +178,7 @@ def test_metadata_tell_pose_corners_and_sun(built):
     document = json.loads((built / "metadata" / "000003.json").read_text())
     for key in ("latitude_deg", "longitude_deg", "altitude_km", "tilt_deg", "azimuth_deg", "corners_deg"):
         assert key in document
-    rotation = np.array(document["camera_from_mcmf"])
-    assert_allclose(rotation @ document["sun_mcmf"], document["sun_camera"], atol=1e-12)
+    assert_allclose(np.array(document["camera_from_mcmf"]) @ document["sun_mcmf"], document["sun_camera"], atol=1e-12)
     assert len(document["corners_deg"]) == 4
 
 
@@ -349,8 +347,7 @@ def test_places_follow_the_ephemeris_and_not_its_step_within_boxes_and_buffers(p
     coarse = laid(source(polar_orbit), 20)
     assert_array_equal(fine.utc_ns[::2], coarse.utc_ns)
     assert_allclose(fine.position_mcmf_m[::2], coarse.position_mcmf_m, atol=1e-3)
-    north = source(polar_orbit, boxes=(Box(0.0, 360.0, 10.0, 60.0),), avoid=(Box(0.0, 360.0, 40.0, 50.0),))
-    track = laid(north, 20)
+    track = laid(source(polar_orbit, boxes=(Box(0.0, 360.0, 10.0, 60.0),), avoid=(Box(0.0, 360.0, 40.0, 50.0),)), 20)
     latitude = np.degrees(spherical_from_mcmf(track.position_mcmf_m)[0])
     # A footprint from 30 km reaches 1.76 degrees to each side at its edge, 2.5 in its corners; the buffer is 60 km.
     assert latitude.min() > 10.0 + 1.7
@@ -409,8 +406,7 @@ def test_the_shipped_recipe_of_the_papers_data_set_flies_the_shipped_orbit():
     recipe = load_recipe(ROOT / "scenarios" / "paper-dataset.toml")
     (along,) = recipe.sources
     assert (along.split, along.light, along.step_s, along.days) == ("80/15/5", "paper", 30.0, 30.0)
-    day = dataclasses.replace(along, days=0.1, step_s=60.0)
-    track = laid(day, 60, recipe.seed)
+    track = laid(dataclasses.replace(along, days=0.1, step_s=60.0), 60, recipe.seed)
     altitude_km = spherical_from_mcmf(track.position_mcmf_m)[2] / 1e3
     # The paper's orbit flies between 14.0 and 48.6 km.
     assert altitude_km.min() > 13.0 and altitude_km.max() < 50.0
@@ -422,8 +418,7 @@ def test_places_are_ordered_so_that_neighbours_on_the_ground_follow_each_other()
     latitude = 0.8 * np.sin(step / 60.0)
     longitude = -step / 377.0 * math.radians(0.3)
     altitude_m = np.where(np.cos(step / 60.0) > 0.0, 14e3, 48e3)
-    position = np.asarray(mcmf_from_spherical(latitude, longitude, altitude_m))
-    order = order_by_ground(position, CAMERA, Everywhere())
+    order = order_by_ground(np.asarray(mcmf_from_spherical(latitude, longitude, altitude_m)), CAMERA, Everywhere())
     assert np.array_equal(np.sort(order), step)
 
     def tiles(order):

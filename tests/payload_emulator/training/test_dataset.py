@@ -309,8 +309,7 @@ def test_a_spot_lands_where_the_label_says(sun, seed):
         if not (12 < x < 371 and 12 < y < 371):
             continue
         i, j = round(float(y)), round(float(x))
-        window = crop.image[i - 8 : i + 9, j - 8 : j + 9].astype(float)
-        weight = np.clip(window - np.median(crop.image), 0, None)
+        weight = np.clip(crop.image[i - 8 : i + 9, j - 8 : j + 9].astype(float) - np.median(crop.image), 0, None)
         rows, columns = np.mgrid[i - 8 : i + 9, j - 8 : j + 9]
         # Half a pixel: rounding to 8 bits and clipping of the spot's core shift its centroid by less.
         assert (columns * weight).sum() / weight.sum() == approx(x, abs=0.5)
@@ -344,8 +343,7 @@ def targets(u, v, diameter, tiers=Tier.LABEL, weight=1.0, *classes):
 
 def perfect_maps(*places):
     t = targets(*places)
-    geometry = np.concatenate([t.geometry, np.zeros((1, 128, 128), np.float32)])
-    return t, geometry
+    return t, np.concatenate([t.geometry, np.zeros((1, 128, 128), np.float32)])
 
 
 def test_decoding_the_targets_returns_the_craters():
@@ -448,14 +446,12 @@ def test_a_footprint_near_a_forbidden_box_is_refused_also_over_the_zero_meridian
     places = ((0.0, 284.0), (0.0, 283.1), (0.0, 282.9), (58.0, 281.5))
     found = [bool(allowed(source, world, np.array([north]), np.array([east]))) for north, east in places]
     assert found == [False, False, True, False]
-    box = Box(350.0, 370.0, -10.0, 10.0)
-    inside = inside_box(box, np.zeros(4), np.array([355.0, 5.0, 12.0, 349.0]), 0.0)
+    inside = inside_box(Box(350.0, 370.0, -10.0, 10.0), np.zeros(4), np.array([355.0, 5.0, 12.0, 349.0]), 0.0)
     assert inside.tolist() == [True, True, False, False]
 
 
 def test_shards_hold_every_frame_once_and_each_source_its_share():
-    recipe = procedural_recipe()
-    shards = plan_shards(recipe, 300)
+    shards = plan_shards(procedural_recipe(), 300)
     assert [n for s in shards for n in s.frame_numbers] == list(range(300))
     assert sum(s.frames for s in shards if s.source.split == "train") == 240
 

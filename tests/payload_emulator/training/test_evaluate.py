@@ -77,8 +77,7 @@ def test_figures_name_their_data_their_level_and_both_ways_of_scoring(detector, 
 
 
 def test_the_report_shows_the_worst_frames_and_says_what_it_lacks(detector, blob_dataset, scored):
-    figures = summary(detector, [blob_dataset], scored, "test")
-    report = detector_report(detector, scored, figures)
+    report = detector_report(detector, scored, summary(detector, [blob_dataset], scored, "test"))
     assert len(report.worst_frames) == 4
     page = render_html(report)
     for words in ("By type of terrain", "By altitude", "By Sun elevation", "Predicted uncertainty", "ignore-aware"):
@@ -149,14 +148,12 @@ def test_an_exported_network_agrees_with_torch_and_carries_its_origin(exported, 
     assert metadata["training_seed"] == "1"
     assert json.loads(metadata["data"])[0]["labels_sha256"] == blob_dataset.digest
     assert float(metadata["score_threshold"]) == figures["score_threshold"]
-    tested = json.loads(metadata["test_figures"])["test"]
-    assert set(tested) == {"frames", "level", "strict", "ignore_aware"}
+    assert set(json.loads(metadata["test_figures"])["test"]) == {"frames", "level", "strict", "ignore_aware"}
 
 
 def test_the_papers_variant_keeps_its_class_heatmaps_and_is_scored_by_them(exported, blob_dataset):
     octets, _ = exported
-    detector = OnnxDetector(octets)
-    heatmap, geometry = detector.run_network(np.zeros((1, 1, 512, 512), np.float32))
+    heatmap, geometry = OnnxDetector(octets).run_network(np.zeros((1, 1, 512, 512), np.float32))
     assert heatmap.shape[1] == 4 and geometry.shape[1] == 5
     scored = evaluate(octets, blob_dataset, threshold=0.01, paper_classes=True)
     assert [row["size_class"] for row in scored["per_class"]] == [0, 1, 2]
@@ -243,8 +240,7 @@ def test_pulls_that_cancel_over_all_suns_remain_in_their_octants():
 def test_octants_of_a_few_craters_name_no_worst_one():
     truth, found = shifted_scene(10.0, (2.0, 0.0))
     columns = ("u_px", "v_px", "diameter_px", "diameter_m", "depth_ratio", "ids")
-    few = replace(truth, **{name: getattr(truth, name)[:5] for name in columns})
-    _, overall = bias_of((few, found))
+    _, overall = bias_of((replace(truth, **{name: getattr(truth, name)[:5] for name in columns}), found))
     assert overall["pairs"] == 5 and overall["worst_octant"] is None
 
 
@@ -338,8 +334,7 @@ def test_groups_hold_their_own_frames_and_no_others():
 
 
 def test_a_common_shift_is_the_bias_of_its_sun_octant():
-    part = scene(*GRID, shift=(0.4, -0.2), azimuth=np.radians(100.0))
-    figures = figures_of([part], [LOW])
+    figures = figures_of([scene(*GRID, shift=(0.4, -0.2), azimuth=np.radians(100.0))], [LOW])
     biased = [row for row in figures["bias_px_by_sun_octant"] if row["pairs"]]
     assert [row["octant"] for row in biased] == [2]
     assert (biased[0]["du_px"], biased[0]["dv_px"]) == approx((0.4, -0.2))
@@ -361,8 +356,7 @@ def test_sigma_is_called_calibrated_where_errors_follow_it():
 
 def test_states_said_are_counted_against_the_terrains_own():
     fresh = scene([100, 200], [100, 200], depth=0.15, said=0.15)
-    wrong = scene([100], [100], depth=0.15, said=0.03)
-    state = figures_of([fresh, wrong], [LOW, LOW])["degradation_state"]
+    state = figures_of([fresh, scene([100], [100], depth=0.15, said=0.03)], [LOW, LOW])["degradation_state"]
     assert state["confusion"] == [[0, 0, 0], [0, 0, 0], [1, 0, 2]]
     assert state["agreement"] == approx(2 / 3)
 
@@ -420,8 +414,7 @@ def test_precision_recall_and_f1_of_a_case_counted_by_hand():
 def test_the_pixel_rule_ends_at_ten_pixels_and_the_radius_rule_at_half_a_radius():
     frame = truth([100], [100])
     for u, right, rule in ((110, 1, {}), (110.1, 0, {}), (107.4, 1, {"radii": 0.5}), (107.6, 0, {"radii": 0.5})):
-        tallied = tally([frame], [found([u], [100], [0.9])], rule=MatchRule(**rule))
-        assert tallied.figures(0.5).detected_true == right
+        assert tally([frame], [found([u], [100], [0.9])], rule=MatchRule(**rule)).figures(0.5).detected_true == right
 
 
 def test_a_ghost_counts_when_strict_and_is_left_out_when_ignore_aware():
@@ -455,8 +448,7 @@ def test_nothing_expected_and_nothing_found_gives_no_figure_instead_of_a_perfect
 
 def test_the_best_threshold_separates_right_from_wrong():
     frames = [truth([100, 200], [100, 200])] * 5
-    detections = [found([100, 200, 300], [100, 200, 300], [0.8, 0.7, 0.3])] * 5
-    threshold, figures = best_threshold(tally(frames, detections))
+    threshold, figures = best_threshold(tally(frames, [found([100, 200, 300], [100, 200, 300], [0.8, 0.7, 0.3])] * 5))
     assert 0.3 < threshold <= 0.7
     assert figures.f1 == 1.0
 
@@ -489,8 +481,7 @@ def test_a_precision_that_rests_on_a_handful_of_detections_decides_nothing():
     place = np.linspace(5.0, 505.0, 20)
     u, v = (part.ravel()[:n] for part in np.meshgrid(place, place))
     score = np.linspace(0.94, 0.30, n)
-    craters = truth(u[2:], v[2:], diameter=10.0)
-    tallied = tally([craters], [found(u, v, score)], rule=MatchRule(pixels=3.0))
+    tallied = tally([truth(u[2:], v[2:], diameter=10.0)], [found(u, v, score)], rule=MatchRule(pixels=3.0))
     assert tallied.figures(0.93).precision < 0.9
     assert threshold_for_precision(tallied, 0.9) < 0.31
 
@@ -516,8 +507,7 @@ def test_the_odds_put_in_are_the_odds_found():
     offset = np.interp(np.log([14.0, 20.0, 40.0]), model.log_diameter_px, model.offset)
     # Some 10,000 detections: the standard error of an offset is about 0.08.
     assert offset == approx(1.0 - np.log(np.array([14.0, 20.0, 40.0]) / 20.0), abs=0.3)
-    half = model.probability(np.array([0.5]), np.array([20.0]))[0]
-    assert half == approx(np.e / (1.0 + np.e), abs=0.05)
+    assert model.probability(np.array([0.5]), np.array([20.0]))[0] == approx(np.e / (1.0 + np.e), abs=0.05)
 
 
 def test_too_few_detections_are_refused():
@@ -590,8 +580,7 @@ def test_a_data_set_without_validation_frames_is_refused(make_blob_dataset, tmp_
 
 
 def test_a_calibrated_model_gives_back_the_plain_one():
-    octets = load_shipped_model()
-    plain = plain_model(octets)
+    plain = plain_model(load_shipped_model())
     metadata = OnnxDetector(plain).metadata
     assert CALIBRATION_KEY not in metadata and metadata["score_threshold"] == "0.44"
     assert plain_model(plain) == plain

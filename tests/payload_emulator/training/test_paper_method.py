@@ -148,7 +148,6 @@ def test_odometry_takes_the_class_of_a_classified_detection_and_its_prior_gives_
     heat[2, 64, 64] = 0.9
     found = decode_classes(heat, np.zeros((2, 128, 128), np.float32), MEDIANS_M, 0.4)
     camera = PinholeCamera()
-    features = frame_features(found, 30e3, camera, Mode.paper)
-    assert features.ground.size_class.tolist() == [2]
+    assert frame_features(found, 30e3, camera, Mode.paper).ground.size_class.tolist() == [2]
     sized = found.with_prior_sizes(np.array([30e3]), camera.focal_px)
     assert sized.diameter_px[0] == approx(camera.focal_px * 18e3 / 30e3)

@@ -70,8 +70,7 @@ def test_the_best_validation_is_kept(blob_dataset, tmp_path, monkeypatch):
         "_validate",
         lambda *_: {"f1": next(values), "precision": 0.0, "recall": 0.0, "loc_px": 1.0, "threshold": 0.4},
     )
-    parameters = replace(SHORT, steps=3, validate_every_minutes=0.0)
-    figures = train([blob_dataset], tmp_path, parameters)
+    figures = train([blob_dataset], tmp_path, replace(SHORT, steps=3, validate_every_minutes=0.0))
     assert figures["steps"] == 3 and figures["best"] == {"f1": 0.5, "step": 1}
 
 
@@ -97,8 +96,7 @@ def test_a_network_retrained_with_learned_craters_finds_them_elsewhere_and_no_fe
     train([listed], tmp_path / "old", parameters := replace(SHORT, steps=40))
     recall = []
     for name, learned in (("further", None), ("learned", pits_at(here, listed))):
-        start = tmp_path / "old" / "checkpoint.pt"
-        train([listed], tmp_path / name, parameters, start_from=start, landmarks=learned)
+        train([listed], tmp_path / name, parameters, start_from=tmp_path / "old" / "checkpoint.pt", landmarks=learned)
         network, _ = load_network(tmp_path / name / "checkpoint.pt")
         found = [detect_with_network(network, unseen, one, "cpu") for one in frames]
         recall.append([tally(truth, found).figures(0.1).recall for truth in truths])

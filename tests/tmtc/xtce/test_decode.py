@@ -129,8 +129,7 @@ def test_other_signs_are_read():
     for value in (-255, -1, 0, 1, 255):
         ones = value if value >= 0 else ~-value & 0x1FF
         sign = value if value >= 0 else 0x100 | -value
-        found = one(Bits().add(ones, 9).add(sign, 9).packed(), types, A="ONES", B="SIGN")
-        assert found == {"A": [value], "B": [value]}
+        assert one(Bits().add(ones, 9).add(sign, 9).packed(), types, A="ONES", B="SIGN") == {"A": [value], "B": [value]}
 
 
 # The examples of MIL-STD-1750A for 32 and 48 bits, and the least positive step of 48 bits at exponent 0 by hand
@@ -180,16 +179,14 @@ def test_a_value_outside_its_spline_is_unknown_and_keeps_its_raw_value_unless_ex
     found = decoded(layout(lines, A="T"), packets)
     assert found.counts()["decoded"] == 7 and found.values_unknown() == {"A": 2}
     assert found.tables["P"].columns["A"].to_list(raw=True) == [9, 10, 19, 20, 25, 40, 41]
-    differs = child(comparison("A", 1.0, "!="))
-    text = layout(lines, differs, A="T")
+    text = layout(lines, child(comparison("A", 1.0, "!=")), A="T")
     assert decoded(text, packets).tables["Q"].packet_index.tolist() == [2, 3, 4, 5]  # nothing is known of the others
 
 
 def test_splines_of_yamcs_are_extrapolated_and_its_sizes_before_texts_count_octets():
     spline = foreign.spline([(0, 0), (100, 10)], 1, False).replace(' extrapolate="false"', "")
     tagged = fixed_size(72, '<LeadingSize sizeInBitsOfSizeTag="8"/>')
-    types = calibrated("T", 8, "unsigned", default(spline)) + text_type(tagged, name="S")
-    text = layout(types, A="T", B="S")
+    text = layout(calibrated("T", 8, "unsigned", default(spline)) + text_type(tagged, name="S"), A="T", B="S")
     packet = bytes((200, 8)) + b"ABCDEFGH"
     others = decoded(text, [packet])
     assert values(text, [packet])["B"] == ["A"] and others.values_unknown() == {"A": 1}
@@ -233,8 +230,7 @@ def test_a_text_may_say_its_length_itself():
     ]
     assert verdicts(text, wrong) == ["decoded", "too_short", "decoded", "too_short"]
     assert values(text, wrong) == {"A": [None, None], "B": [7, 7]}
-    column = decoded(text, wrong).tables["P"].columns["A"]
-    assert column.to_list(raw=True)[1] == b"\0\2\xc3\x28"
+    assert decoded(text, wrong).tables["P"].columns["A"].to_list(raw=True)[1] == b"\0\2\xc3\x28"
     bits = Decoder(parse_xtce(text, "bits")).decode(*whole([struct.pack(">H", 12) + b"yyyy"]))
     assert bits.tables["P"].columns["A"].to_list() == [None]  # no whole octets
 
@@ -250,16 +246,14 @@ def test_octets_may_say_their_length_themselves_as_yamcs_writes_it():
 def test_a_text_may_end_with_a_character_and_what_follows_begins_there():
     types = variable(10, "<TerminationChar>00</TerminationChar>") + integer("N", 8)
     text = layout(types, A="T", B="N")
-    found = values(text, [b"\0\x05", b"ab\0\x06", b"abcdefghi\0\x07"])
-    assert found == {"A": ["", "ab", "abcdefghi"], "B": [5, 6, 7]}
+    assert values(text, [b"\0\x05", b"ab\0\x06", b"abcdefghi\0\x07"]) == {"A": ["", "ab", "abcdefghi"], "B": [5, 6, 7]}
     assert verdicts(text, [b"abc", b"abcdefghijk\0\x07"]) == ["too_short", "malformed"]
     last = layout(types, A="T")
     assert values(last, [b"abc"])["A"] == ["abc"]  # the text fills what is left
 
 
 def test_a_text_without_terminator_fills_its_field_and_one_of_two_octets_stands_at_a_character():
-    types = text_type(fixed_size(24, "<TerminationChar/>")) + integer("N", 8)
-    text = layout(types, A="T", B="N")
+    text = layout(text_type(fixed_size(24, "<TerminationChar/>")) + integer("N", 8), A="T", B="N")
     packets = [b"ab\0\x07", b"abc\x07", b"\xc3\x28\0\x07"]
     assert values(text, packets) == {"A": ["ab", "abc", None], "B": [7] * 3}
     assert decoded(text, packets).values_unknown() == {"A": 1}
@@ -275,8 +269,7 @@ def test_zeros_at_the_end_of_a_text_belong_to_it(charset):
     if not charset.startswith("UTF-16"):
         expected = [one * 2 for one in expected]
     expected += [one.replace("\0", "z") for one in expected] * 3
-    packets = [one.encode(charset) for one in expected]
-    assert values(text, packets)["A"] == expected
+    assert values(text, [one.encode(charset) for one in expected])["A"] == expected
 
 
 def test_texts_that_begin_inside_an_octet_are_read_and_a_size_may_be_looked_up():
@@ -339,8 +332,7 @@ def test_arrays_of_aggregates_follow_their_count_as_in_the_pus_examples_of_yamcs
 
 
 def test_elements_of_odd_width_begin_anywhere():
-    types = integer("N", 5) + integer("E", 11) + array_type("A", "E", dimension("n"))
-    text = layout(types, n="N", a="A", z="N")
+    text = layout(integer("N", 5) + integer("E", 11) + array_type("A", "E", dimension("n")), n="N", a="A", z="N")
     rng = np.random.default_rng(3)
     rows = [rng.integers(0, 2048, n).tolist() for n in (0, 1, 2, 7, 31)]
     packets = []
@@ -355,8 +347,7 @@ def test_elements_of_odd_width_begin_anywhere():
 
 def test_arrays_of_two_dimensions_are_lists_of_lists_the_last_index_moving_fastest():
     types = integer("N", 8) + array_type("A", "N", dimension("n") + dimension(last=4, first=3))
-    found = one(bytes((3, 1, 2, 3, 4, 5, 6)), types, n="N", a="A")
-    assert found["a"] == [[[1, 2], [3, 4], [5, 6]]]
+    assert one(bytes((3, 1, 2, 3, 4, 5, 6)), types, n="N", a="A")["a"] == [[[1, 2], [3, 4], [5, 6]]]
 
 
 def test_elements_that_say_their_own_length_are_read_one_after_another():
@@ -491,8 +482,7 @@ def test_names_in_nested_systems_are_found_by_path_and_distinguished():
 def test_definitions_may_be_spread_over_documents():
     types = document(integer("u8", 8), {}, "", name="dt")
     packets = document("", {"x": "/dt/u8"}, container("P", ["x"]), name="PUS")
-    definition = parse_xtce({"dt.xml": types, "pus.xml": packets})
-    found = Decoder(definition).decode(*whole([b"\x2a"]))
+    found = Decoder(parse_xtce({"dt.xml": types, "pus.xml": packets})).decode(*whole([b"\x2a"]))
     assert found.tables["P"].columns["x"].to_list() == [42]
 
 
@@ -523,15 +513,13 @@ def test_a_packet_is_decoded_by_one_container_or_refused_with_the_reason():
 def test_damaged_packets_are_left_out():
     octets, cut = whole([b"\x01", b"\x02"])
     damaged = PacketCut(cut.offsets, cut.lengths, np.array([True, False]), cut.skipped, cut.idle, cut.consumed)
-    definition = parse_xtce(layout(integer("N", 8), a="N"))
-    found = Decoder(definition).decode(octets, damaged)
+    found = Decoder(parse_xtce(layout(integer("N", 8), a="N"))).decode(octets, damaged)
     assert found.tables["P"].columns["a"].to_list() == [1] and found.verdict.tolist() == [0, 5]
 
 
 @mark.parametrize("count", [0, 1, 2, 255])
 def test_an_array_cut_off_is_too_short_and_a_negative_count_malformed(count):
-    types = integer("N", 8) + integer("E", 32) + array_type("A", "E", dimension("n", intercept=-3))
-    text = layout(types, n="N", a="A")
+    text = layout(integer("N", 8) + integer("E", 32) + array_type("A", "E", dimension("n", intercept=-3)), n="N", a="A")
     full = bytes((count,)) + bytes(4 * max(count - 2, 0))
     expected = "malformed" if count < 2 else "decoded"
     assert verdicts(text, [full]) == [expected]
@@ -542,15 +530,13 @@ def test_an_array_cut_off_is_too_short_and_a_negative_count_malformed(count):
 @mark.parametrize("slope, verdict", [(-8, "malformed"), (0.5, "malformed"), (1e300, "too_short"), (8, "decoded")])
 def test_sizes_that_are_none_condemn_the_packet_alone(slope, verdict):
     text = layout(integer("N", 64) + binary(dynamic("n", slope=slope)), n="N", b="B")
-    packets = [struct.pack(">Q", 3) + b"abc", struct.pack(">Q", 2**64 - 1) + b"abc"]
-    found = verdicts(text, packets)
+    found = verdicts(text, [struct.pack(">Q", 3) + b"abc", struct.pack(">Q", 2**64 - 1) + b"abc"])
     assert found[0] == verdict and found[1] != "decoded"
 
 
 def test_an_element_that_its_calibrator_does_not_cover_is_unknown_alone():
     element = calibrated("E", 8, "unsigned", default(foreign.spline([(0, 0), (100, 50)], 1, False)))
-    types = integer("N", 8) + element + array_type("A", "E", dimension("n"))
-    text = layout(types, n="N", a="A", z="N")
+    text = layout(integer("N", 8) + element + array_type("A", "E", dimension("n")), n="N", a="A", z="N")
     packets = [bytes((2, 10, 20, 1)), bytes((3, 30, 101, 40, 2)), bytes((1, 100, 3)), bytes((0, 4))]
     assert verdicts(text, packets) == ["decoded"] * 4
     found = values(text, packets)
@@ -574,8 +560,7 @@ def test_noise_is_decoded_or_given_a_verdict_and_never_stops_the_others():
     good = foreign.capture(50, 6)
     noise = [space_packet(int(rng.integers(100, 103)), rng.bytes(int(rng.integers(1, 200))), 0) for _ in range(500)]
     mixed = [p for pair in zip(good, noise[:50], strict=True) for p in pair] + noise[50:]
-    found = Decoder(definition).decode(*whole(mixed))
-    assert found.verdict[0:100:2].tolist() == [0] * 50
+    assert Decoder(definition).decode(*whole(mixed)).verdict[0:100:2].tolist() == [0] * 50
 
 
 def test_chunks_of_packets_are_joined(monkeypatch):

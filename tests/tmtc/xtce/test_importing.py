@@ -296,8 +296,7 @@ def test_conditions_are_joined_and_compared_as_written():
 
     inner = f"<ORedConditions>{condition('a', '<', 'b')}{condition('b', '==', '0')}</ORedConditions>"
     joined = f"<ANDedConditions>{condition('a', '!=', '5')}{inner}</ANDedConditions>"
-    expression = f"<BooleanExpression>{joined}</BooleanExpression>"
-    text = layout(U8, child(expression), a="u8", b="u8")
+    text = layout(U8, child(f"<BooleanExpression>{joined}</BooleanExpression>"), a="u8", b="u8")
     pairs = [(a, b) for a in range(8) for b in range(8)]
     found = decoded(text, [bytes(pair) for pair in pairs])
     expected = [k for k, (a, b) in enumerate(pairs) if a != 5 and (a < b or b == 0)]
@@ -315,14 +314,12 @@ OPERATORS = {"==": "3", "!=": "124", "<": "12", "<=": "123", ">": "4", ">=": "34
 ])  # fmt: skip
 def test_comparisons_mean_what_they_say(operator, width, value, types):
     text = layout(types, child(comparison("a", value, operator)), a="t")
-    found = chosen(text, *(k.to_bytes(width, "big") for k in range(1, 5)))
-    assert found == [int(k) - 1 for k in OPERATORS[operator]]
+    assert chosen(text, *(k.to_bytes(width, "big") for k in range(1, 5))) == [int(k) - 1 for k in OPERATORS[operator]]
 
 
 def test_names_of_codes_are_compared():
     for operator, expected in (("==", [1]), ("!=", [0, 2])):
-        text = layout(MODES, child(comparison("a", "ON", operator)), a="m")
-        assert chosen(text, b"\0", b"\1", b"\2") == expected
+        assert chosen(layout(MODES, child(comparison("a", "ON", operator)), a="m"), b"\0", b"\1", b"\2") == expected
 
 
 @mark.parametrize("spelling", ["IEEE-754", "IEEE754", "IEEE754_1985"])
@@ -410,8 +407,7 @@ def test_entries_are_repeated_as_arrays():
 def test_integers_may_be_stored_as_floats_octet_orders_listed_and_commands_refuse_nothing():
     types = floating("t", 32).replace("FloatParameterType", "IntegerParameterType")
     types += floating("f", 32).replace("FloatParameterType", "BooleanParameterType")
-    text = layout(types, a="t", b="f")
-    assert values(text, [struct.pack(">ff", 42.0, 1.0)]) == {"a": [42.0], "b": [True]}
+    assert values(layout(types, a="t", b="f"), [struct.pack(">ff", 42.0, 1.0)]) == {"a": [42.0], "b": [True]}
     for order, value in (("3,2,1,0", 0x01020304), ("0,1,2,3", 0x04030201)):
         assert values(of_type(integer("t", 32, order=order)), [b"\1\2\3\4"]) == {"a": [value]}
     assert "byteOrder" in refused(of_type(integer("t", 32, order="2,3,0,1")))
@@ -452,8 +448,7 @@ def test_descriptions_alarms_algorithms_and_commands_change_nothing():
     )
     text = document(types, {"a": "t"}, PLAIN, more="<CommandMetaData><MetaCommandSet/></CommandMetaData>")
     text = text.replace("</ContainerSet>", "</ContainerSet><AlgorithmSet><CustomAlgorithm name='x'/></AlgorithmSet>")
-    definition = parse_xtce(text)
-    (parameter,) = definition.parameters.values()
+    (parameter,) = parse_xtce(text).parameters.values()
     assert isinstance(parameter.type, ScalarType) and parameter.type.unit == "m"
     assert isinstance(parameter.type.encoding, IntegerEncoding)
     assert parameter.type.encoding.calibration.default == Polynomial(((1.0, 0), (2.0, 1)))
