@@ -25,6 +25,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
+from numpy.linalg import norm
+from numpy.random import default_rng
 from pytest import mark
 
 from ground_service.errors import GroundError
@@ -155,8 +157,8 @@ def orbit_figures(path):
 
 def attitudes(**fields):
     position, velocity = orbit().at(times(ELAPSED_S))
-    down = -position / np.linalg.norm(position, axis=1, keepdims=True)
-    ahead = velocity / np.linalg.norm(velocity, axis=1, keepdims=True)
+    down = -position / norm(position, axis=1, keepdims=True)
+    ahead = velocity / norm(velocity, axis=1, keepdims=True)
     q_wxyz = [quaternion_from_matrix(m) for m in np.stack([np.cross(-ahead, down), -ahead, down], axis=1)]
     return (AttitudeSegment(times(ELAPSED_S), np.array(q_wxyz), **fields),)
 
@@ -246,7 +248,7 @@ LISTS = {
 
 
 def list_text(name, column="id", change="v"):
-    rng = np.random.default_rng(3)
+    rng = default_rng(3)
     diameter_m = 3_000.0 * (1.0 - rng.random(60)) ** -0.5
     columns = dict(
         zip(
@@ -334,7 +336,7 @@ def turned(path):
 
 
 def labels():
-    rng = np.random.default_rng(5)
+    rng = default_rng(5)
     boxes = np.column_stack([rng.uniform(10, 400, (30, 2)), *[rng.uniform(9, 60, 30)] * 2]).tolist()
     image = {"id": 7, "file_name": "a.png", "width": 512, "height": 480, "sun_azimuth_deg": 30.0, "pixel_m": 90.0}
     listed = [{"id": k, "image_id": 7, "category_id": 2 - (k % 3 > 0), "bbox": box} for k, box in enumerate(boxes)]
@@ -364,7 +366,7 @@ def labelled(path):
 def picture(path, change="a"):
     import cv2
 
-    shades = (np.random.default_rng(2).random((48, 64)) ** 2 * 60_000).astype(np.uint16)
+    shades = (default_rng(2).random((48, 64)) ** 2 * 60_000).astype(np.uint16)
     cv2.imwrite(str(path), np.ascontiguousarray(value(change, a=shades)))
 
 

@@ -5,6 +5,7 @@ import json
 from pathlib import Path
 
 import numpy as np
+from numpy.random import default_rng
 from pytest import fixture, mark
 
 import linna
@@ -13,7 +14,7 @@ from tests.payload_emulator.bowls import BOWL_CENTRES, bowl_image
 
 
 def speckled(shape=(512, 512), dtype=np.uint8):
-    return (np.random.default_rng(2).integers(30, 220, shape) * (np.iinfo(dtype).max // 255)).astype(dtype)
+    return (default_rng(2).integers(30, 220, shape) * (np.iinfo(dtype).max // 255)).astype(dtype)
 
 
 @fixture
@@ -89,7 +90,7 @@ def test_detect_finds_the_sun_that_is_not_given_and_says_so_in_one_line(write_im
 
 
 def test_a_picture_without_craters_leaves_the_sun_unknown(write_image, capsys):
-    noise = np.random.default_rng(3).integers(90, 110, (300, 400)).astype(np.uint8)
+    noise = default_rng(3).integers(90, 110, (300, 400)).astype(np.uint8)
     assert run(["detector", "detect", str(write_image("a.png", noise)), "--json"]) == 0
     out, err = capsys.readouterr()
     assert json.loads(out)["images"][0]["sun"]["source"] == "unknown"

@@ -1,10 +1,13 @@
 """The camera against OpenCV, rays and facts computed by hand; the study of the field of view."""
 
 import math
+from math import cos, radians, sin
 
 import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
+from numpy.linalg import norm
+from numpy.random import default_rng
 from pytest import approx, mark, raises
 from scipy.special import pdtrc
 
@@ -37,11 +40,11 @@ def test_the_facts_of_the_paper_hold_to_their_printed_digits():
     assert f"{CAMERA.focal_px:.2f}" == "147.80"  # 256 / tan 60 deg
     sizes = np.array([14e3, 30e3, 48.6e3]) / CAMERA.focal_px
     assert [f"{v:.1f}" if v < 100 else f"{v:.0f}" for v in sizes] == ["94.7", "203", "329"]
-    assert f"{ground_arc_m(math.radians(60), 30e3) / 1e3:.1f}" == "53.4"
+    assert f"{ground_arc_m(radians(60), 30e3) / 1e3:.1f}" == "53.4"
 
 
 def test_projection_is_that_of_opencv_about_the_middle_and_to_half_the_field_of_view():
-    points = np.random.default_rng(1).uniform([-50e3, -50e3, 10e3], [50e3, 50e3, 60e3], (100, 3))
+    points = default_rng(1).uniform([-50e3, -50e3, 10e3], [50e3, 50e3, 60e3], (100, 3))
     f, (cx, cy) = CAMERA.focal_px, CAMERA.centre_px
     theirs, _ = cv2.projectPoints(points, np.zeros(3), np.zeros(3), np.array([[f, 0, cx], [0, f, cy], [0, 0, 1]]), None)
     assert np.allclose(CAMERA.project(points), theirs[:, 0], atol=1e-9)
@@ -53,7 +56,7 @@ def test_projection_is_that_of_opencv_about_the_middle_and_to_half_the_field_of_
 def test_the_nadir_camera_looks_down_with_north_up_and_east_right(latitude, longitude, altitude_m):
     position = mcmf_from_spherical(latitude, longitude, altitude_m)
     rotation = nadir_camera_from_mcmf(position)
-    assert np.allclose(rotation[2], -position / np.linalg.norm(position), atol=1e-12)
+    assert np.allclose(rotation[2], -position / norm(position), atol=1e-12)
     east, north = enu_from_mcmf(latitude, longitude)[:2]
     ground = mcmf_from_spherical(latitude, longitude)
     right, up = project_mcmf(CAMERA, rotation, position, ground + 1000.0 * np.stack([east, north])) - 255.5
@@ -68,7 +71,7 @@ def test_what_a_pixel_sees_projects_back_into_it(latitude, longitude, altitude_m
     if np.isnan(point).any():  # the corners of the image look past the limb from high up
         assert math.hypot(u - 255.5, v - 255.5) > 255.0
         return
-    assert np.linalg.norm(point) == approx(MOON_RADIUS_M + height_m, abs=1e-6)
+    assert norm(point) == approx(MOON_RADIUS_M + height_m, abs=1e-6)
     # 1e-6 px is a tenth of a millimetre on the ground.
     assert np.allclose(project_mcmf(CAMERA, rotation, position, point), [u, v], atol=1e-6)
 
@@ -76,16 +79,16 @@ def test_what_a_pixel_sees_projects_back_into_it(latitude, longitude, altitude_m
 def test_points_behind_the_camera_and_rays_past_the_limb_are_nan():
     assert np.isnan(CAMERA.project([0.0, 0.0, -1.0])).all()
     position = mcmf_from_spherical(0.0, 0.0, 30e3)
-    level = np.cross(position / np.linalg.norm(position), [0, 0, 1.0])
-    assert np.isnan(intersect_sphere(position, np.stack([level, position / np.linalg.norm(position)]))).all()
+    level = np.cross(position / norm(position), [0, 0, 1.0])
+    assert np.isnan(intersect_sphere(position, np.stack([level, position / norm(position)]))).all()
 
 
 @given(latitudes, longitudes, altitudes_m, st.floats(0.0, 1.2))
 def test_the_range_to_the_sphere_is_that_of_the_cosine_rule(latitude, longitude, altitude_m, off_nadir):
     distance = MOON_RADIUS_M + altitude_m
-    expected = distance * math.cos(off_nadir) - math.sqrt(MOON_RADIUS_M**2 - (distance * math.sin(off_nadir)) ** 2)
+    expected = distance * cos(off_nadir) - math.sqrt(MOON_RADIUS_M**2 - (distance * sin(off_nadir)) ** 2)
     rotation = enu_from_mcmf(latitude, longitude)
-    direction = math.sin(off_nadir) * rotation[0] - math.cos(off_nadir) * rotation[2]
+    direction = sin(off_nadir) * rotation[0] - cos(off_nadir) * rotation[2]
     found = intersect_sphere(mcmf_from_spherical(latitude, longitude, altitude_m), direction)
     assert found == approx(expected, abs=1e-5)
 
@@ -132,7 +135,7 @@ UNIFORM = paper_density_catalogue(1, uniform=True)
 
 
 def random_positions(n, seed, low_m=14e3, high_m=48e3):
-    rng = np.random.default_rng(seed)
+    rng = default_rng(seed)
     latitude, longitude = np.arcsin(rng.uniform(-1, 1, n)), rng.uniform(-np.pi, np.pi, n)
     return mcmf_from_spherical(latitude, longitude, rng.uniform(low_m, high_m, n))
 
@@ -142,7 +145,7 @@ def test_counts_in_the_footprint_are_those_of_projecting_every_crater():
     study = study_field_of_view(positions, UNIFORM)
     ground = mcmf_from_spherical(UNIFORM.latitude_rad, UNIFORM.longitude_rad)
     for fov_deg in (60.0, 120.0, 150.0):
-        camera = PinholeCamera(fov_rad=math.radians(fov_deg))
+        camera = PinholeCamera(fov_rad=radians(fov_deg))
         seen = []
         for position in positions:
             uv = project_mcmf(camera, nadir_camera_from_mcmf(position), position, ground)
@@ -156,13 +159,13 @@ def test_uniform_craters_follow_poisson_in_the_true_footprint():
     altitude_m, fov_deg = 20e3, 90.0
     study = study_field_of_view(random_positions(20_000, 5, altitude_m, altitude_m), UNIFORM, (fov_deg,))
     # Ground area of the image: each pixel's solid angle times range^2 over the cosine of incidence.
-    camera = PinholeCamera(200, 200, math.radians(fov_deg))
+    camera = PinholeCamera(200, 200, radians(fov_deg))
     position = mcmf_from_spherical(0.0, 0.0, altitude_m)
     v, u = np.mgrid[0:200, 0:200]
     rays = camera.rays(np.stack([u, v], -1)) @ nadir_camera_from_mcmf(position)
     range_m = intersect_sphere(position, rays)
     normal = (position + range_m[..., None] * rays) / MOON_RADIUS_M
-    solid = (rays @ -position / np.linalg.norm(position)) ** 3 / camera.focal_px**2
+    solid = (rays @ -position / norm(position)) ** 3 / camera.focal_px**2
     area_m2 = np.sum(range_m**2 * solid / np.abs(np.sum(normal * rays, -1)))
     expected = len(UNIFORM) / (4 * np.pi * MOON_RADIUS_M**2) * area_m2
     for n in (1, 3, 5):

@@ -8,6 +8,7 @@ import numpy as np
 import spiceypy
 from hypothesis import given
 from hypothesis import strategies as st
+from numpy.random import default_rng
 from pytest import approx, fixture, mark, raises
 from scipy.interpolate import KroghInterpolator
 
@@ -56,14 +57,14 @@ def at_s(ephemeris, elapsed_s):
 
 
 EVEN_S = np.arange(20) * 30.0
-IRREGULAR_S = np.cumsum(np.random.default_rng(2).uniform(10.0, 60.0, 120)) - 10.0
+IRREGULAR_S = np.cumsum(default_rng(2).uniform(10.0, 60.0, 120)) - 10.0
 
 
 @mark.parametrize("degree", [1, 3, 5, 7, 9, 11])
 def test_hermite_interpolation_is_that_of_scipy_on_the_same_states(degree):
     ephemeris = arc(IRREGULAR_S, degree=degree)
     count = max((degree + 1) // 2, 2)
-    asked = np.random.default_rng(3).uniform(IRREGULAR_S[0] + 1, IRREGULAR_S[-1] - 1, 300)
+    asked = default_rng(3).uniform(IRREGULAR_S[0] + 1, IRREGULAR_S[-1] - 1, 300)
     position, velocity = at_s(ephemeris, asked)
     for k, t in enumerate(asked):
         step = np.searchsorted(IRREGULAR_S, t, side="right") - 1

@@ -2,6 +2,7 @@
 
 import json
 import math
+from math import cos, pi, radians, sin
 from pathlib import Path
 
 import erfa
@@ -9,6 +10,7 @@ import numpy as np
 import spiceypy
 from hypothesis import given
 from hypothesis import strategies as st
+from numpy.linalg import norm
 from pytest import approx, fixture, mark, raises
 
 from lunar.constants import ASTRONOMICAL_UNIT_M, EARTH_RADIUS_M, MOON_RADIUS_M, NS, SPEED_OF_LIGHT_M_S, SUN_RADIUS_M
@@ -53,7 +55,7 @@ SPICE_EPOCHS_TDB_S = np.array(SPICE["epochs_tdb_s"])
 # The same model in the same arithmetic: 1e-9 rad is 1.7 mm on the ground.
 SAME_MODEL_RAD = 1e-9
 
-unit_quaternions = st.lists(st.floats(-1.0, 1.0), min_size=4, max_size=4).filter(lambda q: np.linalg.norm(q) > 0.1)
+unit_quaternions = st.lists(st.floats(-1.0, 1.0), min_size=4, max_size=4).filter(lambda q: norm(q) > 0.1)
 latitudes = st.floats(-np.pi / 2, np.pi / 2)
 longitudes = st.floats(-2 * np.pi, 2 * np.pi)
 
@@ -62,7 +64,7 @@ def angle_rad(first, second):
     """Angle of the rotation between matrices (..., 3, 3)."""
     difference = first @ np.swapaxes(second, -1, -2)
     off = difference - np.swapaxes(difference, -1, -2)
-    sine = np.linalg.norm(np.stack([off[..., 2, 1], off[..., 0, 2], off[..., 1, 0]]), axis=0) / 2
+    sine = norm(np.stack([off[..., 2, 1], off[..., 0, 2], off[..., 1, 0]]), axis=0) / 2
     return np.arcsin(np.clip(sine, 0, 1))
 
 
@@ -116,7 +118,7 @@ def test_the_rotation_from_principal_to_mean_earth_axes_is_that_of_naif_and_of_9
     assert np.all(apart.max(axis=1) < (1e-3, 1e-9))
     # Williams, Boggs, Folkner 2008: 860 m at most on the surface ("about 0.9 km").
     place = mcmf_from_spherical(*np.meshgrid(np.linspace(-1.5, 1.5, 61), np.linspace(0, 6.2, 63)))
-    assert 850.0 < np.linalg.norm(place @ PA_FROM_ME_DE421.T - place, axis=-1).max() < 900.0
+    assert 850.0 < norm(place @ PA_FROM_ME_DE421.T - place, axis=-1).max() < 900.0
 
 
 @mark.real_data
@@ -167,7 +169,7 @@ def test_rtn_of_a_circular_equatorial_orbit_points_out_along_and_north():
 
 @given(unit_quaternions)
 def test_quaternions_are_those_of_spice_and_survive_the_matrix(values):
-    q = np.array(values) / np.linalg.norm(values)
+    q = np.array(values) / norm(values)
     matrix = matrix_from_quaternion(q)
     # SPICE q2m: v_out = q v q*, scalar first, as here.
     assert np.allclose(matrix, spiceypy.q2m(q), atol=1e-14)
@@ -246,7 +248,7 @@ def day():
 
 def test_a_pass_within_sixty_degrees_lasts_37_minutes_and_epochs_can_be_chosen(day):
     track = ground_track(day, IauOrientation())
-    inside = np.abs(track.latitude_rad) <= math.radians(60)
+    inside = np.abs(track.latitude_rad) <= radians(60)
     edges = np.flatnonzero(np.diff(inside.astype(int)))
     assert np.mean(np.diff(edges)[int(inside[edges[0]]) :: 2] * 15.0 / 60.0) == approx(111.20 / 3, abs=0.1)
     epochs = even_epochs(day, 60.0)
@@ -319,7 +321,7 @@ def test_the_earth_shadowed_the_moon_when_the_eclipse_catalogue_says():
     utc_ns = np.array([parse_utc(f"2018-07-27T{clock}") for clock in ("17:00:00", "20:21:44", "23:45:00")])
     tdb_s = tdb_s_from_utc_ns(utc_ns)
     earth, sun = earth_position_icrf_m(tdb_s), sun_position_icrf_m(tdb_s)
-    position = 1_797_400.0 * earth / np.linalg.norm(earth, axis=1, keepdims=True)
+    position = 1_797_400.0 * earth / norm(earth, axis=1, keepdims=True)
     assert sunlit_fraction(position, sun, earth).tolist() == [1.0, 0.0, 1.0]
     assert sunlit_fraction(position, sun).tolist() == [1.0] * 3
 
@@ -330,7 +332,7 @@ def test_the_sun_sets_on_a_spacecraft_within_a_penumbra_of_the_suns_width():
     # Angle from the anti-Sun direction at which the Sun's centre touches the limb; its disc is 9.3 mrad wide.
     edge = math.asin(MOON_RADIUS_M / radius)
     half = SUN_RADIUS_M / ASTRONOMICAL_UNIT_M
-    angle = np.array([0.0, edge - 2 * half, edge, edge + 2 * half, math.pi])
+    angle = np.array([0.0, edge - 2 * half, edge, edge + 2 * half, pi])
     fraction = sunlit_fraction(radius * np.stack([-np.cos(angle), np.sin(angle), np.zeros(5)], -1), sun)
     assert fraction[[0, 1, 3, 4]].tolist() == [0.0, 0.0, 1.0, 1.0]
     # The limb is so large that it halves the disc like a straight edge; its curvature gives a third of a percent.
@@ -341,10 +343,10 @@ def test_the_sun_sets_on_a_spacecraft_within_a_penumbra_of_the_suns_width():
 def test_the_covered_share_of_a_disc_is_that_of_a_fine_grid(apart, near_radius, far_radius):
     # Far body at unit distance 10, near body at 1, so angular radii are asin(R / d).
     to_far = np.array([10.0, 0.0, 0.0])
-    to_near = np.array([math.cos(apart), math.sin(apart), 0.0])
+    to_near = np.array([cos(apart), sin(apart), 0.0])
     from lunar.visibility import _disc_overlap
 
-    share = _disc_overlap(to_far, 10.0 * math.sin(far_radius), to_near, math.sin(near_radius))
+    share = _disc_overlap(to_far, 10.0 * sin(far_radius), to_near, sin(near_radius))
     x, y = np.meshgrid(*[np.linspace(-far_radius, far_radius, 400)] * 2)
     disc = x**2 + y**2 <= far_radius**2
     covered = (x - apart) ** 2 + y**2 <= near_radius**2
@@ -356,7 +358,7 @@ def test_azimuth_runs_clockwise_from_north_and_the_subsatellite_point_undoes_the
     place = mcmf_from_spherical(0.3, 0.5)
     east, north, up = enu_from_mcmf(0.3, 0.5)
     for azimuth in (0.0, 0.5, 2.0, 4.0, 6.0):
-        sun = place + 1e11 * (math.sin(azimuth) * east + math.cos(azimuth) * north + math.tan(0.2) * up)
+        sun = place + 1e11 * (sin(azimuth) * east + cos(azimuth) * north + math.tan(0.2) * up)
         assert sun_elevation_azimuth(0.3, 0.5, sun) == approx((0.2, azimuth), abs=1e-9)
     tdb_s = tdb_s_from_utc_ns(START + np.arange(3) * 3600 * NS)
     rotation = IauOrientation().mcmf_from_icrf(tdb_s)
@@ -373,9 +375,9 @@ def test_the_limb_hides_the_earth_on_the_far_side_only():
     # the parallax of the Earth, 0.26 deg).
     dip = math.acos(MOON_RADIUS_M / radius)
     parallax = MOON_RADIUS_M / 384_400e3
-    limit = math.pi / 2 + dip - parallax
-    for angle, seen in ((0.0, True), (1.5, True), (limit - 1e-3, True), (limit + 1e-3, False), (math.pi, False)):
-        assert bool(limb_clearance_m(radius * np.array([math.cos(angle), math.sin(angle), 0.0]), earth) > 0.0) is seen
+    limit = pi / 2 + dip - parallax
+    for angle, seen in ((0.0, True), (1.5, True), (limit - 1e-3, True), (limit + 1e-3, False), (pi, False)):
+        assert bool(limb_clearance_m(radius * np.array([cos(angle), sin(angle), 0.0]), earth) > 0.0) is seen
     assert limb_clearance_m([0.0, radius, 0.0], [384_400e3, radius, 0.0]) == np.inf
     assert limb_clearance_m([-1.0, radius, 0.0], [384_400e3, radius, 0.0]) == approx(30e3)
 
@@ -385,7 +387,7 @@ def orbit(hours=6):
     return ephemeris_from_states(times(elapsed), *circle(elapsed, north=POLAR))
 
 
-GOLDSTONE = GroundStation("DSS-14", math.radians(35.42590), math.radians(243.11046), 1002.0)
+GOLDSTONE = GroundStation("DSS-14", radians(35.42590), radians(243.11046), 1002.0)
 
 
 @mark.filterwarnings("ignore:.*dubious year:erfa.ErfaWarning")
@@ -402,7 +404,7 @@ def test_station_and_elevation_are_those_of_astropy():
         time = Time("2024-08-07T18:00:00", scale="utc")
         theirs = place.get_gcrs_posvel(time)[0].xyz.to_value(u.m)
         # UT1 - UTC is 0.02 s and polar motion 0.3 arcseconds then: 10 m each, here left out.
-        assert np.linalg.norm(ours - theirs) < 30.0
+        assert norm(ours - theirs) < 30.0
         moon = np.array([2.0e8, -2.5e8, 2.0e8])
         seen = ITRS(CartesianRepresentation(moon * u.m), obstime=time)
         direction = seen.transform_to(GCRS(obstime=time)).cartesian.xyz.to_value(u.m)
@@ -412,7 +414,7 @@ def test_station_and_elevation_are_those_of_astropy():
     leg = direction - theirs
     up = _zenith(GOLDSTONE) @ _itrf_from_icrf(utc_ns)
     # 1e-4 rad is what the Earth turns in 1.4 s.
-    assert math.asin(leg @ up / np.linalg.norm(leg)) == approx(elevation, abs=1e-4)
+    assert math.asin(leg @ up / norm(leg)) == approx(elevation, abs=1e-4)
 
 
 def test_range_and_light_time_are_those_of_the_signal_that_arrives():
@@ -425,10 +427,10 @@ def test_range_and_light_time_are_those_of_the_signal_that_arrives():
     position, _ = ephemeris.at(emitted)
     # Geocentric places of the spacecraft at emission and of the station at reception.
     spacecraft = position - earth_position_icrf_m(tdb_s_from_utc_ns(emitted))
-    distance = np.linalg.norm(spacecraft - station_icrf(GOLDSTONE, received)[0], axis=1)
+    distance = norm(spacecraft - station_icrf(GOLDSTONE, received)[0], axis=1)
     assert np.allclose(found.range_m, distance, rtol=0, atol=1e-3)
     assert np.all((found.light_time_s > 1.15) & (found.light_time_s < 1.37))
-    assert np.array_equal(found.visible, (found.limb_clearance_m > 0) & (found.elevation_rad >= math.radians(10)))
+    assert np.array_equal(found.visible, (found.limb_clearance_m > 0) & (found.elevation_rad >= radians(10)))
 
 
 def test_the_spacecraft_is_behind_the_moon_about_half_of_a_revolution_that_faces_the_earth():

@@ -6,6 +6,7 @@ import math
 from dataclasses import replace
 
 import numpy as np
+from numpy.linalg import norm
 from numpy.testing import assert_allclose, assert_array_equal
 from pytest import approx, fixture, mark, raises
 
@@ -280,7 +281,7 @@ def test_the_wrong_orbit_is_an_orbit():
     state = np.concatenate([wrong.position_m[0], wrong.velocity_m_s[0]])
 
     def slope(s):
-        return np.concatenate([s[3:], -GM * s[:3] / np.linalg.norm(s[:3]) ** 3])
+        return np.concatenate([s[3:], -GM * s[:3] / norm(s[:3]) ** 3])
 
     worst = 0.0
     for k in range(1, len(TIMES_NS)):
@@ -290,7 +291,7 @@ def test_the_wrong_orbit_is_an_orbit():
             k2 = slope(state + 0.5 * h * k1)
             k3 = slope(state + 0.5 * h * k2)
             state = state + h / 6.0 * (k1 + 2.0 * k2 + 2.0 * k3 + slope(state + h * k3))
-        worst = max(worst, float(np.linalg.norm(state[:3] - wrong.position_m[k])))
+        worst = max(worst, float(norm(state[:3] - wrong.position_m[k])))
     assert np.abs(errors_rtn_m(SECTION, 3)).max() > 5.0
     assert worst < 0.02
 
@@ -331,7 +332,7 @@ def test_the_arcs_of_a_flown_ephemeris_are_those_of_the_reference():
     second = replace(one, utc_ns=one.utc_ns[59:], tai_ns=None, **states_of(one, slice(59, None), 1.00565))
     found = sample_truth(_truth_of_ephemeris(Ephemeris((first, second)), IauOrientation()), TIMES_NS[[30, 90]])
     assert found.segments[0].stop_utc_ns == found.segments[1].start_utc_ns == TIMES_NS[59]
-    radii = np.linalg.norm([found.segments[0].position_m[-1], found.segments[1].position_m[0]], axis=1)
+    radii = norm([found.segments[0].position_m[-1], found.segments[1].position_m[0]], axis=1)
     assert_allclose(radii, [RADIUS_M, 1.00565 * RADIUS_M], atol=1.0)
 
 

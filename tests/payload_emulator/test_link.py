@@ -3,6 +3,7 @@
 from dataclasses import replace
 
 import numpy as np
+from numpy.linalg import norm
 from pytest import approx, mark, raises
 
 from lunar.ephemeris import ephemeris_from_states
@@ -134,9 +135,9 @@ def circling(hours=4.0):
     """A circular polar orbit at 30 km whose plane holds the Earth at the epoch, in closed form."""
     times = EPOCH + np.arange(-300, int(3600 * hours) + 300, 10) * 10**9
     toward = np.asarray(earth_position_icrf_m(float(tdb_s_from_utc_ns(EPOCH))))
-    u = toward / np.linalg.norm(toward)
+    u = toward / norm(toward)
     w = np.cross(u, np.cross([0.0, 0.0, 1.0], u))
-    w /= np.linalg.norm(w)
+    w /= norm(w)
     rate = np.sqrt(4.9028e12 / 1.7674e6**3)
     angle = rate * (times - EPOCH)[:, None] / 1e9
     position = 1.7674e6 * (np.cos(angle) * u + np.sin(angle) * w)

@@ -11,6 +11,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from numpy.linalg import norm
 from pytest import fixture, mark, raises
 
 from lunar.camera import project_mcmf
@@ -139,8 +140,8 @@ def test_rings_of_the_catalogue_lie_on_the_rims_of_the_rendered_ground():
     sphere = project_mcmf(*axes, mcmf_from_spherical(craters.latitude_rad, craters.longitude_rad, 0.0))
     shown = np.array([[one["u_px"], one["v_px"]] for one in rings])
     assert len(rings) > 20
-    assert np.median(np.linalg.norm(shown - rims, axis=1)) < 0.2  # px; what is left is the tilt of rims
-    assert np.linalg.norm(shown - sphere, axis=1).max() > 5.0  # px: heights matter
+    assert np.median(norm(shown - rims, axis=1)) < 0.2  # px; what is left is the tilt of rims
+    assert norm(shown - sphere, axis=1).max() > 5.0  # px: heights matter
     assert all(one["minor_px"] <= one["diameter_px"] <= one["major_px"] for one in rings)
 
 

@@ -5,7 +5,9 @@ from functools import partial
 
 import numpy as np
 import pytest
-from numpy.testing import assert_array_equal
+from numpy.linalg import norm
+from numpy.random import default_rng
+from numpy.testing import assert_allclose, assert_array_equal
 from pytest import approx, fixture, mark
 from scipy.special import chdtri
 
@@ -199,7 +201,7 @@ def test_craters_that_the_payload_mapped_are_met_again_and_their_errors_known(mo
 
 
 def test_a_regional_shift_has_its_size_and_is_alike_over_its_angle():
-    rng = np.random.default_rng(5)
+    rng = default_rng(5)
     # Pairs of places 30 degrees apart on the equator, and 2 degrees.
     longitude = np.radians(np.array([0.0, 2.0, 30.0]))
     draws = np.stack([regional_field(np.zeros(3), longitude, np.radians(30.0), rng) for _ in range(300)])
@@ -235,7 +237,7 @@ def test_a_scenario_distorts_the_map_that_is_uploaded_by_the_stated_amount(tmp_p
 
 def test_slow_errors_wander_with_the_memory_they_are_given():
     elapsed_s = np.full(40_000, 15.0)
-    rng = np.random.default_rng(0)
+    rng = default_rng(0)
     values = montecarlo._wandering(np.zeros(2), 0.5, 150.0, elapsed_s, rng)[200:]
     assert np.std(values) == approx(0.5, rel=0.05)
     # Ten steps of 15 s: exp(-1).
@@ -248,10 +250,10 @@ def test_an_acceleration_that_lasts_moves_the_truth_as_it_should(shipped):
     """A nearly constant push across the plane over ten minutes."""
     still = replace(shipped, lasting_m_s2=(0.0, 0.0, 0.0))
     pushed = replace(shipped, lasting_m_s2=(0.0, 0.0, 1e-4), lasting_correlation_s=1e9)
-    rng = np.random.default_rng(0)
-    (here, _), (there, _) = (montecarlo._truth(case, rng, np.random.default_rng(3)) for case in (still, pushed))
-    acceleration = 1e-4 * np.random.default_rng(3).standard_normal(3)[2]
-    np.testing.assert_allclose(there[0, :3], here[0, :3], atol=1e-6)
+    rng = default_rng(0)
+    (here, _), (there, _) = (montecarlo._truth(case, rng, default_rng(3)) for case in (still, pushed))
+    acceleration = 1e-4 * default_rng(3).standard_normal(3)[2]
+    assert_allclose(there[0, :3], here[0, :3], atol=1e-6)
     k = 40  # ten minutes
     normal = rtn_from_inertial(here[k, :3], here[k, 3:])[2]
     rate = 2.0 * np.pi / 6_672.0
@@ -273,13 +275,13 @@ def test_tracks_differ_and_draw_their_nodes_where_they_say():
         case = standard_case(DataFolder(), track, 0.2)
         longitudes = []
         for seed in range(12):
-            drawn = montecarlo._with_drawn_node(case, np.random.default_rng((seed, 2)))
+            drawn = montecarlo._with_drawn_node(case, default_rng((seed, 2)))
             rotation = case.orientation.mcmf_from_icrf(float(tdb_s_from_utc_ns(case.epoch_utc_ns)))
             normal = rotation @ np.cross(drawn.position_icrf_m, drawn.velocity_icrf_m_s)
             node = np.cross(axis, normal)
             longitudes.append(float(np.degrees(np.arctan2(node[1], node[0]))) % 360.0)
-            inclinations[track] = float(np.degrees(np.arccos(normal[2] / np.linalg.norm(normal))))
-            altitudes[track] = float(np.linalg.norm(drawn.position_icrf_m)) - 1_737.4e3
+            inclinations[track] = float(np.degrees(np.arccos(normal[2] / norm(normal))))
+            altitudes[track] = float(norm(drawn.position_icrf_m)) - 1_737.4e3
         spread = np.ptp(longitudes)
         assert spread > 150.0 if track != "limb" else 75.0 <= min(longitudes) <= max(longitudes) <= 105.0
     assert inclinations["inclined"] == approx(60.0, abs=2.0)

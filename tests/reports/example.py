@@ -6,6 +6,8 @@ a single-frame fix.
 """
 
 import numpy as np
+from numpy.linalg import norm
+from numpy.random import default_rng
 
 from reports.values import (
     AnchorRead,
@@ -64,14 +66,14 @@ def _altitude_m(elapsed_s):
 
 
 def _geodetic(position_m):
-    radius = np.linalg.norm(position_m, axis=-1)
+    radius = norm(position_m, axis=-1)
     latitude = np.degrees(np.arcsin(position_m[:, 2] / radius))
     longitude = np.degrees(np.arctan2(position_m[:, 1], position_m[:, 0])) % 360.0
     return latitude, longitude, radius - RADIUS_M
 
 
 def _quantiles(error_rtn_m, drift_percent, path_m):
-    length = np.linalg.norm(error_rtn_m, axis=1)
+    length = norm(error_rtn_m, axis=1)
     length = length[np.isfinite(length)]
     if not len(length):
         return NavigationStatistics()
@@ -97,7 +99,7 @@ def _odometry(rng, imaging, drift_m):
     trigger = np.where(np.cumsum(starts) == 1, "initialization", "time_gap")
     walked = np.cumsum(rng.normal(drift_m, drift_m, (n, 3)), axis=0)
     error = walked - walked[np.maximum.accumulate(np.where(starts, np.arange(n), 0))]
-    before = np.where(starts & (trigger == "time_gap"), np.linalg.norm(drift_m) * 60.0, np.nan)
+    before = np.where(starts & (trigger == "time_gap"), norm(drift_m) * 60.0, np.nan)
     error[~imaging] = np.nan
     resets = int(starts.sum())
     return {
@@ -131,7 +133,7 @@ def _filter(rng, imaging, cadence_s):
 
 def crater_image(seed):
     """A gray frame of 512 by 512 pixels with shaded bowls, and their centres and diameters in pixels."""
-    rng = np.random.default_rng(seed)
+    rng = default_rng(seed)
     gray = rng.normal(118.0, 5.0, (512, 512))
     u, v, diameter = rng.uniform(20, 492, 14), rng.uniform(20, 492, 14), rng.choice([15, 22, 30, 44, 70], 14)
     rows, columns = np.mgrid[0:512, 0:512]
@@ -147,7 +149,7 @@ def size_class(diameter_px):
 
 def gallery_frame(seed, frame_number=1, utc_ns=None):
     image, (u, v, diameter) = crater_image(seed)
-    rng = np.random.default_rng(seed + 1)
+    rng = default_rng(seed + 1)
     seen = rng.random(len(u)) < 0.72
     false = int(rng.integers(0, 3))
     found_u, found_v, found_d = (
@@ -163,7 +165,7 @@ def gallery_frame(seed, frame_number=1, utc_ns=None):
 
 
 def detector_score(seed=3):
-    rng = np.random.default_rng(seed)
+    rng = default_rng(seed)
     n = 2_400
     azimuth = rng.uniform(-45.0, 45.0, n) % 360.0
     u, v = rng.uniform(0, 511, (2, n))
@@ -193,7 +195,7 @@ def detector_score(seed=3):
 
 def pass_report(seed=7, *, hours=37.1 / 60.0, cadence_s=15.0, gallery=6, worst=10):
     """A complete pass report; with ``hours=24`` a whole day of windows between 60 degrees south and north."""
-    rng = np.random.default_rng(seed)
+    rng = default_rng(seed)
     n = max(1, round(hours * 3600.0 / cadence_s))
     elapsed = np.arange(n) * cadence_s + 40.0
     utc_ns = START_UTC_NS + (elapsed * 1e9).astype(np.int64)
@@ -359,7 +361,7 @@ def _changed_track(i):
 
 def regression_report(seed=12, count=24):
     """A candidate that is better on the whole and worse in a few passes."""
-    rng = np.random.default_rng(seed)
+    rng = default_rng(seed)
     return RegressionReport(
         title="Build 0.2.0 against 0.1.0",
         regression_id="R-17",

@@ -7,12 +7,14 @@ import math
 import re
 import struct
 import zlib
+from math import nan
 from pathlib import Path
 
 import numpy as np
 from ccsdspy import FixedLength, PacketArray, PacketField, VariableLength
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from numpy.random import default_rng
 from numpy.testing import assert_allclose, assert_array_equal
 from pytest import approx, mark, raises
 
@@ -110,7 +112,7 @@ def test_fields_stand_where_the_interface_says():
 
 
 def test_ccsdspy_reads_the_repeated_items_to_the_same_raw_values():
-    rng = np.random.default_rng(3)
+    rng = default_rng(3)
     counts = [0, 1, 7, 255, 3]
     octets = b"".join(pack("detections", detections(count, rng)) for count in counts)
     fields = layout("frame_number:4 image_ticks:8 image_quality:1 count:1 items:1*")
@@ -134,14 +136,14 @@ def detections(count, rng):
 
 
 def test_items_are_mappings_arrays_or_none_and_a_large_sigma_saturates_below_the_code_for_unknown():
-    values = detections(4, np.random.default_rng(1))
+    values = detections(4, default_rng(1))
     rows = [{k: v[n].item() for k, v in values["items"].items()} for n in range(4)]
     assert pack("detections", {**values, "items": rows}) == pack("detections", {**values, "count": 4})
-    _, values = DICTIONARY.unpack(pack("detections", {**detections(0, np.random.default_rng(0)), "items": []}))
+    _, values = DICTIONARY.unpack(pack("detections", {**detections(0, default_rng(0)), "items": []}))
     assert values["count"] == 0 and values["items"]["u_px"].size == 0
     table = tables_of(pack("detections", {"frame_number": 1, "image_ticks": 1, "image_quality": 0}))["detections"]
     assert len(table) == 1 and table.item_owner.size == 0
-    values = detections(3, np.random.default_rng(0))
+    values = detections(3, default_rng(0))
     values["items"]["sigma_px"] = np.array([np.nan, 100.0, 0.5])
     _, back = DICTIONARY.unpack(pack("detections", values))
     assert_array_equal(back["items"]["sigma_px"], [np.nan, 254 / 64, 0.5])
@@ -150,7 +152,7 @@ def test_items_are_mappings_arrays_or_none_and_a_large_sigma_saturates_below_the
 @settings(max_examples=60, deadline=None)
 @given(st.integers(0, 2**32 - 1), st.integers(0, 255))
 def test_quantised_columns_come_back_within_half_a_step(seed, count):
-    values = detections(count, np.random.default_rng(seed))
+    values = detections(count, default_rng(seed))
     _, back = DICTIONARY.unpack(pack("detections", values))
     for name, column in values["items"].items():
         atol = {"score": 0.5 / 255, "size_class": 0}.get(name, 0.5 / 64) + 1e-12
@@ -171,7 +173,7 @@ def raw_values(f):
         if f.maximum is not None:
             high = min(high, math.floor((f.maximum - f.offset) / f.scale + 1e-9))
         one = st.integers(low, high).map(
-            lambda raw: math.nan if raw == f.missing else raw * f.scale + f.offset if f.is_calibrated else raw
+            lambda raw: nan if raw == f.missing else raw * f.scale + f.offset if f.is_calibrated else raw
         )
     return one if f.size == 1 else st.lists(one, min_size=f.size, max_size=f.size)
 
@@ -226,7 +228,7 @@ def test_every_telecommand_of_the_dictionary_comes_back_equal(data):
     ({"boot_count": 65536}, "expected an integer from 0 to 65535, found 65536"),
     ({"boot_count": 1.5}, "expected an integer"), ({"storage_used_permille": 1001}, "from 0 to 1000, found 1001"),
     ({"structure_id": 2}, "from 1 to 1"), ({"temprature_c": 1.0}, "no such field"),
-    ({"temperature_c": math.nan}, "expected a number from -327.68 to 327.67"),
+    ({"temperature_c": nan}, "expected a number from -327.68 to 327.67"),
 ])  # fmt: skip
 def test_values_that_break_the_rules_are_refused_with_field_and_range(change, message):
     with raises(ValueRefused, match=message):
@@ -239,7 +241,7 @@ def test_a_missing_value_is_refused():
 
 
 def test_positions_outside_their_range_are_refused_and_more_items_than_fit_too():
-    values, many = (detections(count, np.random.default_rng(0)) for count in (2, 256))
+    values, many = (detections(count, default_rng(0)) for count in (2, 256))
     for items, message in (
         ({"u_px": [-1.0, 5.0]}, r"detections\.u_px"), ({"u_px": [5.0]}, "columns of one length"),
         (many["items"], "at most 255 items"),
@@ -251,7 +253,7 @@ def test_positions_outside_their_range_are_refused_and_more_items_than_fit_too()
 
 
 def test_a_number_too_large_for_single_precision_is_refused():
-    values = {f.name: [math.nan] * 3 if f.size > 1 else 0 for f in DICTIONARY.packet("navigation_state").fields}
+    values = {f.name: [nan] * 3 if f.size > 1 else 0 for f in DICTIONARY.packet("navigation_state").fields}
     pack("navigation_state", values | {"velocity_icrf_m_s": [1e38, 0.0, 0.0]})
     with raises(ValueRefused):
         pack("navigation_state", values | {"velocity_icrf_m_s": [1e39, 0.0, 0.0]})
@@ -295,7 +297,7 @@ def test_a_dictionary_that_defines_a_packet_twice_is_refused():
 
 
 def test_a_column_is_made_once_when_it_is_asked_for_and_integers_do_not_wrap():
-    tables = tables_of(pack("housekeeping", HOUSEKEEPING) + pack("detections", detections(2, np.random.default_rng(0))))
+    tables = tables_of(pack("housekeeping", HOUSEKEEPING) + pack("detections", detections(2, default_rng(0))))
     assert set(tables) == {"housekeeping", "detections"}
     columns = tables["housekeeping"].columns
     assert list(columns) == [f.name for f in DICTIONARY.packet("housekeeping").fields]
@@ -324,7 +326,7 @@ def test_unsigned_integers_of_64_bits_stay_what_was_sent(value):
 
 def test_limits_tell_warning_from_alarm_and_a_dictionary_survives_being_written_down():
     field = DICTIONARY.packet("housekeeping").field
-    values = [-41.0, -30.0, -20.0, 20.0, 60.0, 61.0, 86.0, math.nan]
+    values = [-41.0, -30.0, -20.0, 20.0, 60.0, 61.0, 86.0, nan]
     found = limit_states(field("temperature_c"), values).tolist()
     assert found == [ALARM, WARNING, 0, 0, 0, WARNING, ALARM, WITHIN_LIMITS]
     assert limit_states(field("mode"), [3]).tolist() == [WITHIN_LIMITS]
@@ -396,7 +398,7 @@ def test_values_of_events_are_read_as_names_and_unknown_ones_are_not_invented():
         ("table_loaded", 3.0, float(0xDF7F5779), "gravity, hash df7f5779"),
         ("camera_fault", 82.0, 3.0, "82 frames without image, camera switched 3 times"),
         ("telecommand_rejected", 5.0, float(0x1885C007), "telecommand with sequence count 7: wrong mode"),
-        ("mode_changed", 1.0, None, "1"), ("mode_changed", 1.0, math.nan, "1"), ("no_such_event", 4.0, 0.5, "4, 0.5"),
+        ("mode_changed", 1.0, None, "1"), ("mode_changed", 1.0, nan, "1"), ("no_such_event", 4.0, 0.5, "4, 0.5"),
         ("attitude_missing", 0.0, 0.0, ""),
     ):  # fmt: skip
         assert event_text(name, first, second) == expected
@@ -484,7 +486,7 @@ def test_every_telecommand_has_a_text_for_its_least_values():
     assert len({one.number for one in PARAMETERS}) == len(PARAMETERS)
 
 
-RNG = np.random.default_rng(3)
+RNG = default_rng(3)
 STATES = RNG.standard_normal((2, 9)) * np.repeat([1.7e6, 1.6e3, 1e-6], 3)
 _ROOTS = RNG.standard_normal((2, 9, 9)) * np.repeat([40.0, 0.05, 1e-6], 3)[:, None]
 COVARIANCES = _ROOTS @ np.swapaxes(_ROOTS, 1, 2)

@@ -5,6 +5,7 @@ import functools
 import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from numpy.random import default_rng
 from pytest import mark, raises
 from spacepackets.ccsds.tm_frame import TmFramePrimaryHeader, TmTransferFrame
 
@@ -42,7 +43,7 @@ WITHDRAWN = bytes.fromhex(
 
 
 def make_packets(count, seed=0, boot=1, start_s=0):
-    rng = np.random.default_rng(seed)
+    rng = default_rng(seed)
     sequencer = PacketSequencer()
     packets = []
 
@@ -291,7 +292,7 @@ def test_unknown_packets_are_counted_given_settings_used_and_markers_without_fra
     assert decoded.unknown == 2 and not decoded.complete
     assert decoded.by_apid[0x55] == decoded.by_apid[0x0AE] == 1
     assert WITHDRAWN in set(packets_of(decoded))
-    noise = np.random.default_rng(3).integers(0, 256, (30, 700), dtype=np.uint8)
+    noise = default_rng(3).integers(0, 256, (30, 700), dtype=np.uint8)
     noise[:, :4] = np.frombuffer(ASM, dtype=np.uint8)
     with raises(LinkFormatError, match="mostly 700 octets apart"):
         read(noise.tobytes())
@@ -379,7 +380,7 @@ def test_headers_are_those_of_the_standard_and_of_spacepackets_and_checksums_hol
     assert (theirs.master_channel_id.spacecraft_id, theirs.vc_id) == (ours.spacecraft_id[0], ours.virtual_channel[0])
     assert (theirs.master_ch_frame_count, theirs.vc_frame_count) == (ours.master_count[0], ours.channel_count[0])
     assert theirs.frame_datafield_status.first_header_pointer == ours.first_header_pointer[0]
-    frames = np.random.default_rng(0).integers(0, 256, (5, 100), dtype=np.uint8)
+    frames = default_rng(0).integers(0, 256, (5, 100), dtype=np.uint8)
     append_frame_checksums(frames)
     assert frame_checksums_hold(frames).all()
     frames[3, 50] ^= 1
@@ -450,7 +451,7 @@ def test_sequences_begin_as_the_standards_print_them_and_repeat_after_their_full
 
 @mark.parametrize("name", ["none", "legacy", "long", "telecommand"])
 def test_randomising_twice_gives_the_frames_back(name):
-    frames = np.random.default_rng(0).integers(0, 256, (3, 1275), dtype=np.uint8)
+    frames = default_rng(0).integers(0, 256, (3, 1275), dtype=np.uint8)
     assert np.array_equal(randomise(randomise(frames, name), name), frames)
 
 
@@ -478,7 +479,7 @@ def test_stretches_and_channels_of_control_words_add_up_and_others_are_passed_ov
     found = [(one.virtual_channel, one.frames, one.changes, one.report_value) for one in seen]
     assert found == [(0, 2, 0, 9), (3, 2, 1, 2)]
     assert uplink_seen(words(0, TYPE_TWO_REPORT)) == () == uplink_seen(words())
-    rng = np.random.default_rng(5)
+    rng = default_rng(5)
     for _ in range(50):
         stream = words(*(Clcw(0, int(n), lockout=bool(n == 1)) for n in rng.integers(0, 3, 60)))
         first, last = sorted(rng.choice(np.arange(1, 60), 2, replace=False).tolist())

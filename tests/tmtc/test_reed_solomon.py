@@ -2,6 +2,7 @@ import numpy as np
 import reedsolo
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from numpy.random import default_rng
 from pytest import mark, raises
 
 from tmtc.errors import LinkFormatError
@@ -19,7 +20,7 @@ from tmtc.link.reed_solomon import (
 
 
 def frames_for(code, count=3, seed=0):
-    return np.random.default_rng(seed).integers(0, 256, (count, code.frame_length), dtype=np.uint8)
+    return default_rng(seed).integers(0, 256, (count, code.frame_length), dtype=np.uint8)
 
 
 def independent(errors):
@@ -81,7 +82,7 @@ def test_frames_that_no_code_carries_are_refused():
 
 @mark.parametrize("code", [ReedSolomon(), ReedSolomon(8, 2, 5), ReedSolomon(16, 1, 40, False)], ids=str)
 def test_as_many_wrong_symbols_as_promised_are_repaired_and_counted_in_each_codeword(code):
-    rng = np.random.default_rng(1)
+    rng = default_rng(1)
     frames = frames_for(code, code.errors + 2)
     blocks = encode(frames, code)
     words = blocks.reshape(frames.shape[0], -1, code.interleave)
@@ -116,7 +117,7 @@ def test_errors_found_in_the_virtual_fill_mean_that_too_many_others_were_there()
 def test_repair_agrees_with_an_independent_decoder_up_to_and_beyond_its_power(errors):
     theirs = independent(errors)
     code = ReedSolomon(errors=errors, interleave=1, dual_basis=False)
-    rng = np.random.default_rng(errors)
+    rng = default_rng(errors)
     frames = frames_for(code, 60)
     words = encode(frames, code)
     for n in range(60):
@@ -134,7 +135,7 @@ def test_repair_agrees_with_an_independent_decoder_up_to_and_beyond_its_power(er
 
 
 def test_noise_is_uncorrectable_and_no_blocks_are_no_frames():
-    noise = np.random.default_rng(8).integers(0, 256, (300, 255), dtype=np.uint8)
+    noise = default_rng(8).integers(0, 256, (300, 255), dtype=np.uint8)
     # by the count of codewords within reach, 1 word of noise in 16! = 2e13 decodes with E = 16
     assert (repair(noise, ReedSolomon(interleave=1))[1] == UNCORRECTABLE).all()
     code = ReedSolomon()

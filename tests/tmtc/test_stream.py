@@ -5,6 +5,7 @@ from itertools import accumulate
 import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from numpy.random import default_rng
 from pytest import mark
 
 from tests.tmtc.test_downlink import make_packets
@@ -122,7 +123,7 @@ def test_idle_packets_are_counted_and_not_given_and_those_of_the_other_type_are_
 
 def test_noise_and_endless_headers_give_no_packets_and_hide_none():
     # 4 MB of noise hold some 500,000 places where a header could stand, eight of which a bare CRC would believe
-    noise = np.random.default_rng(11).integers(0, 256, 4 << 20, dtype=np.uint8)
+    noise = default_rng(11).integers(0, 256, 4 << 20, dtype=np.uint8)
     cut = cut_packets(noise)
     assert int(cut.crc_ok.sum()) == 0
     assert cut.octets_skipped + cut.lengths.sum() == noise.size
@@ -131,7 +132,7 @@ def test_noise_and_endless_headers_give_no_packets_and_hide_none():
     cut = cut_packets(octets)
     assert not cut.crc_ok.any()
     assert_every_octet_is_accounted_for(octets, cut)
-    rng = np.random.default_rng(12)
+    rng = default_rng(12)
     parts = []
     for packet in PACKETS[:200]:
         parts += [rng.integers(0, 256, int(rng.integers(0, 3000)), dtype=np.uint8).tobytes(), packet]
@@ -203,7 +204,7 @@ def test_whatever_happens_no_whole_packet_is_lost_and_none_is_invented(injuries)
 @mark.parametrize("cases", [1_000, 100_000])
 def test_injured_streams_lose_no_whole_packet_and_invent_none(cases):
     # each case is a segment of its own: two to five packets, of which one to three octets are hit by chance
-    rng = np.random.default_rng(2029)
+    rng = default_rng(2029)
     kinds = [
         DICTIONARY.pack("connection_report", {}, ticks=1, sequence_count=0),
         DICTIONARY.pack("verification_started", {"request_id": 77}, ticks=1, sequence_count=0),

@@ -9,6 +9,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 from lxml import etree
+from numpy.random import default_rng
 from numpy.testing import assert_allclose, assert_array_equal
 from pytest import mark, raises
 from scipy.spatial.transform import Rotation
@@ -34,7 +35,7 @@ def rows_of(table):
 
 
 def ephemeris():
-    rng = np.random.default_rng(1)
+    rng = default_rng(1)
     matrix = rng.normal(size=(6, 6))
     covariances = [Covariance(START + k * 60 * NS, "RTN", (k + 1) * matrix @ matrix.T) for k in (0, 1)]
 
@@ -225,7 +226,7 @@ def test_years_outside_64_bits_of_nanoseconds_are_refused(year):
 
 
 def attitudes(count=6):
-    q = np.random.default_rng(4).normal(size=(count, 4))
+    q = default_rng(4).normal(size=(count, 4))
     return AttitudeSegment(
         START + np.arange(count) * 15 * NS,
         continuous_quaternions(q / np.linalg.norm(q, axis=1, keepdims=True)),

@@ -7,6 +7,7 @@ from functools import partial
 
 import numpy as np
 import spiceypy
+from numpy.random import default_rng
 from numpy.testing import assert_allclose, assert_array_equal
 from pytest import approx, mark, raises
 
@@ -118,7 +119,7 @@ def test_an_spk_is_of_polynomials_where_these_are_exact_and_states_their_error()
     smooth = spk_kernel(Ephemeris((arc(0, 7200),)), CRAFT)
     assert (smooth.data_type, smooth.states) == (3, 8)  # records of 16 minutes
     assert smooth.error_m is not None and smooth.error_m < 1e-4
-    rng = np.random.default_rng(1)
+    rng = default_rng(1)
     seconds = np.cumsum(rng.uniform(30.0, 90.0, 60))
     position, velocity = circular(seconds)
     jagged = position + rng.normal(scale=50.0, size=(60, 3))
@@ -184,7 +185,7 @@ def test_a_file_that_is_no_spk_is_refused_in_one_line(tmp_path):
 def test_ck_clock_and_frame_turn_vectors_as_the_attitudes_do(tmp_path):
     utc_ns = START + np.arange(0, 600, 15) * NS
     ticks = ticks_from_utc_ns(utc_ns)
-    rng = np.random.default_rng(3)
+    rng = default_rng(3)
     q_wxyz = rng.normal(size=4) + 0.01 * np.arange(len(ticks))[:, None] * rng.normal(size=4)
     q_wxyz /= np.linalg.norm(q_wxyz, axis=1, keepdims=True)
     q_wxyz[7] *= -1.0

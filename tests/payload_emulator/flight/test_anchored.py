@@ -215,7 +215,7 @@ def about_deg(case):
     model = ForceModel(case.gravity, case.orientation, 10)
     flown = propagate(start, case.position_icrf_m, case.velocity_icrf_m_s, at - start + 1.0, model)
     place = case.orientation.mcmf_from_icrf(at) @ flown.state(at)[:3]
-    return np.degrees([np.arcsin(place[2] / np.linalg.norm(place)), np.arctan2(place[1], place[0])])
+    return np.degrees([np.arcsin(place[2] / norm(place)), np.arctan2(place[1], place[0])])
 
 
 def turn_deg(case, rows):
@@ -235,4 +235,4 @@ def test_a_stale_catalogue_misleads_nobody(navigation_case, wrong_share):
     else:
         # Nothing on board is where it should be: hardly a fix is believed, and the claimed sigma grows past the error.
         assert np.mean(run.fixed) < 0.2
-        assert np.median(run.error_m[late]) < 4.0 * np.median(np.linalg.norm(run.sigma_rtn_m[late], axis=1))
+        assert np.median(run.error_m[late]) < 4.0 * np.median(norm(run.sigma_rtn_m[late], axis=1))

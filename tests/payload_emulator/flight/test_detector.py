@@ -6,6 +6,7 @@ import json
 import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
+from numpy.random import default_rng
 from pytest import approx, fixture, mark, raises
 
 from payload_emulator.errors import ModelError
@@ -272,7 +273,7 @@ def test_a_slope_is_no_evidence_of_a_crater():
 
 
 def test_nothing_to_be_seen_gives_no_sun_and_a_dark_picture_is_a_verdict(detector):
-    outcome = search_picture(detector, np.random.default_rng(3).integers(90, 110, (300, 400)).astype(np.uint8))
+    outcome = search_picture(detector, default_rng(3).integers(90, 110, (300, 400)).astype(np.uint8))
     assert outcome.quality is ImageQuality.OK
     assert outcome.sun is None
     outcome = search_picture(detector, np.zeros((64, 64), np.uint8))
@@ -325,7 +326,7 @@ def test_evidence_comes_from_up_to_four_squares(shape, count):
 
 
 def random_detections(count, seed, side):
-    rng = np.random.default_rng(seed)
+    rng = default_rng(seed)
     diameter = np.exp(rng.normal(3.0, 0.8, count))
     diameter[:: max(1, count // 7)] = np.nan
     return Detections(
@@ -350,7 +351,7 @@ def test_memory_does_not_grow_with_the_square_of_the_detections():
 
 
 def texture(shape=(512, 512, 3), dtype=np.uint8):
-    rng = np.random.default_rng(0)
+    rng = default_rng(0)
     smooth = 100 + 60 * np.sin(np.arange(shape[1]) / 9.0)[None, :] * np.cos(np.arange(shape[0]) / 7.0)[:, None]
     image = smooth + rng.normal(0, 4, shape[:2])
     if len(shape) == 3:
@@ -378,7 +379,7 @@ def test_a_good_frame_has_zero_mean_and_unit_deviation_whatever_its_depth_and_co
 
 @mark.parametrize("shape", [(512, 512), (512, 512, 3), (300, 200, 4), (64, 64, 1)])
 def test_eight_bits_go_a_quicker_way_to_the_same_values(shape):
-    image = np.random.default_rng(1).integers(0, 256, shape, dtype=np.uint8)
+    image = default_rng(1).integers(0, 256, shape, dtype=np.uint8)
     colours = image if image.ndim == 2 else image[..., : 3 if shape[2] >= 3 else 1].mean(axis=2)
     # Rounding of 32-bit numbers up to 4 and the order of sums.
     assert prepare_image(image).gray == approx(prepare_image(colours / 255.0).gray, abs=5e-6)

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 from numpy.linalg import eigvalsh, norm
+from numpy.random import default_rng
 from pytest import approx
 
 from lunar.camera import PinholeCamera, nadir_camera_from_mcmf
@@ -34,7 +35,7 @@ SPACECRAFT_M = 100.0
 
 
 def ground(count, seed):
-    rng = np.random.default_rng(seed)
+    rng = default_rng(seed)
     latitude, longitude = rng.uniform(-0.02, 0.09, count), rng.uniform(-0.02, 0.02, count)
     return mcmf_from_spherical(latitude, longitude, 300.0 + 400.0 * rng.standard_normal(count))
 
@@ -65,7 +66,7 @@ def offset_m(landmark, craters, shift_m=0.0):
 
 def fly(mapper, craters, seed, frames=6, start_ticks=0, east_m=0.0, false=0, error_m=(0.0, 0.0, 0.0)):
     """One pass to the north at 30 km, believed to be `error_m` from where it is."""
-    rng = np.random.default_rng(seed)
+    rng = default_rng(seed)
 
     made = []
     for k in range(frames):

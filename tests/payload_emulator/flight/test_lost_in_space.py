@@ -300,7 +300,7 @@ def small_anchor(moon):
 
 
 def catalogue_table(count=50):
-    rng = np.random.default_rng(2)
+    rng = default_rng(2)
     return CatalogueTable(
         np.arange(count) + 7, rng.uniform(-1.0, 1.0, count), rng.uniform(0.0, 2.0 * np.pi, count),
         rng.uniform(3e3, 30e3, count), rng.uniform(-8e3, 8e3, count), rng.uniform(20.0, 900.0, (count, 3))
@@ -327,7 +327,7 @@ def test_an_anchor_table_interpolates_to_a_millimetre_within_its_span_and_knows_
         assert table.altitude_m(moon.ticks_at(second)) == approx(altitude, abs=0.1)
     seconds = np.arange(0.0, 6_600.0, 60.0)
     table = unpack_anchor_table(moon.anchor(seconds))
-    z = moon.orbit(seconds)[:, 2] / np.linalg.norm(moon.orbit(seconds), axis=1)
+    z = moon.orbit(seconds)[:, 2] / norm(moon.orbit(seconds), axis=1)
     for k in range(2, seconds.size - 2, 7):
         if abs(z[k]) < 0.95:
             sample = table.at(moon.ticks_at(seconds[k]))
@@ -362,7 +362,7 @@ def test_longitudes_on_either_side_of_the_meridian_survive_packing():
 
 
 def test_gravity_orientation_and_initial_state_come_back_exactly():
-    rng = np.random.default_rng(3)
+    rng = default_rng(3)
     lower = np.tril(rng.normal(size=(9, 9)))
     again = unpack_gravity_table(pack_gravity_table(GravityTable("TEST8", 4.9e12, 1.738e6, lower, 2.0 * lower)))
     assert (again.name, again.gm_m3_s2, again.radius_m) == ("TEST8", 4.9e12, 1.738e6)

@@ -3,6 +3,7 @@
 from math import cos, degrees, hypot, isnan, pi, radians, sin, sqrt
 
 import numpy as np
+from numpy.linalg import norm
 from numpy.testing import assert_allclose, assert_array_equal
 from pytest import approx, mark, raises
 
@@ -68,7 +69,7 @@ def test_labels_lie_on_rims_found_by_casting_rays(formula_terrain):
         v, u = np.mgrid[0:512, 0:512]
         points = position + picture.range_m[..., None] * (CAMERA.rays(np.stack([u, v], axis=-1)) @ rotation)
         centre = mcmf_from_spherical(latitude, longitude, 0.0) / MOON_RADIUS_M
-        up = points / np.linalg.norm(points, axis=-1, keepdims=True)
+        up = points / norm(points, axis=-1, keepdims=True)
         arc = np.arccos(np.clip(up @ centre, -1.0, 1.0)) * MOON_RADIUS_M
         # The disc within the rim: its centroid and area are those of the label's ellipse.
         share = np.clip((4500.0 - arc) / 135.0 + 0.5, 0.0, 1.0)
@@ -187,7 +188,7 @@ def test_rays_meet_a_smooth_sphere_where_geometry_says(formula_terrain):
     uv = np.array([[255.5, 255.5], [400.25, 30.5], [0.0, 511.0]])
     hits = cast(terrain, CAMERA, position, rotation, uv)
     # Heights are single precision and a ray is halved onto the ground to millimetres.
-    assert_allclose(np.linalg.norm(hits, axis=1) - MOON_RADIUS_M, 700.0, atol=0.05)
+    assert_allclose(norm(hits, axis=1) - MOON_RADIUS_M, 700.0, atol=0.05)
     assert_allclose(CAMERA.project((hits - position) @ rotation.T), uv, atol=1e-3)
 
 

@@ -4,6 +4,7 @@ from dataclasses import replace
 from math import cos, degrees, pi, radians, sin, sqrt, tan
 
 import numpy as np
+from numpy.linalg import norm
 from numpy.random import default_rng
 from numpy.testing import assert_allclose, assert_array_equal
 from pytest import approx, fixture, mark, raises
@@ -147,7 +148,7 @@ def test_impossible_sensors_are_refused_by_name(options, message):
 def test_sun_direction_and_angles_are_inverse(latitude_deg, azimuth_deg):
     place = radians(latitude_deg), radians(300.0)
     sun = sun_direction_mcmf(radians(12.0), radians(azimuth_deg), *place)
-    assert np.linalg.norm(sun) == approx(1.0, abs=1e-12)
+    assert norm(sun) == approx(1.0, abs=1e-12)
     elevation, azimuth = sun_angles(sun, *place)
     assert degrees(elevation) == approx(12.0, abs=1e-9)
     assert degrees(azimuth) == approx(azimuth_deg, abs=1e-9)
@@ -382,7 +383,7 @@ def test_the_shadow_of_a_step_ends_where_trigonometry_says(formula_terrain):
     # Along the central meridian the ground south of the wall is dark for height / tan(elevation).
     column = picture.lit[:, 255]
     points = position + picture.range_m[:, 255, None] * rays(rotation)[:, 255]
-    latitude = np.arcsin(points[:, 2] / np.linalg.norm(points, axis=1))
+    latitude = np.arcsin(points[:, 2] / norm(points, axis=1))
     dark = (column < 0.5) & (latitude < edge_rad - 100.0 / MOON_RADIUS_M)
     length = (edge_rad - latitude[dark].min()) * MOON_RADIUS_M
     # The crest lies below the tangent plane by the fall of the Moon over its distance from below the camera.
@@ -459,7 +460,7 @@ COUNT = 20_000
 
 @fixture()
 def rng():
-    return np.random.default_rng(4)
+    return default_rng(4)
 
 
 def test_each_class_is_found_with_its_recall_and_no_other_size(rng):

@@ -1,6 +1,7 @@
 """Rasters: pixels, registration, detail; and as their publishers write them, from PDS3 to JPEG 2000."""
 
 import math
+from math import radians
 
 import numpy as np
 from numpy.testing import assert_allclose, assert_array_equal
@@ -23,7 +24,7 @@ rasterio, warp = Lazy("rasterio"), Lazy("rasterio.warp")
 MOON = "+proj=longlat +R=1737400 +no_defs"
 NONE = make_catalogue([], [], [], source="none")
 AS_IT_IS = {"sharpen": False, "registration_north_m": 0.0, "smoothing_pixels": 0.0}
-METRES_PER_DEGREE = math.radians(MOON_RADIUS_M)
+METRES_PER_DEGREE = radians(MOON_RADIUS_M)
 
 
 def plane(latitude, longitude):
@@ -123,7 +124,7 @@ def test_gld100_metres_of_16_bits_with_holes(tmp_path):
     heights_agree(terrain, np.array([17.1, 15.0]), np.array([15.9, 13.0]), 3.0)
     alone = RasterTerrain([fine], NONE, **AS_IT_IS)
     with raises(TerrainError, match=r"expected heights at latitude .*, found none"):
-        alone.height_m(math.radians(15.0), math.radians(13.0))
+        alone.height_m(radians(15.0), radians(13.0))
 
 
 def test_projected_metres_join_across_tiles_whose_pixels_do_not_divide_the_degree(tmp_path):
@@ -404,7 +405,7 @@ def test_registration_moves_the_raster_over_the_ground(tmp_path):
     path = write_raster(tmp_path / "a.tif", 10.0, 20.0, 8.0, slope)
     moved = RasterTerrain([path], NONE, **(AS_IT_IS | {"registration_north_m": -59.0}))
     still = RasterTerrain([path], NONE, **AS_IT_IS)
-    place = math.radians(15.0), math.radians(14.0)
+    place = radians(15.0), radians(14.0)
     shift_deg = math.degrees(59.0 / MOON_RADIUS_M)
     # What was 59 m farther north is now here: higher, on ground that rises to the north.
     assert float(moved.height_m(*place) - still.height_m(*place)) == approx(100.0 * shift_deg, abs=0.01)

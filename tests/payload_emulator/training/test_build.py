@@ -9,6 +9,7 @@ import resource
 import subprocess
 import sys
 import time
+from math import pi, radians
 from pathlib import Path
 
 import numpy as np
@@ -281,8 +282,8 @@ def test_a_build_by_cycles_without_blender_says_what_is_missing(tmp_path):
 
 START = parse_utc("2029-08-07T00:00:00Z")
 RADIUS_M = 1_737_400.0 + 30_000.0
-PERIOD_S = 2.0 * math.pi * math.sqrt(RADIUS_M**3 / 4.902_800e12)
-CAMERA = PinholeCamera(512, 512, math.radians(120.0))
+PERIOD_S = 2.0 * pi * math.sqrt(RADIUS_M**3 / 4.902_800e12)
+CAMERA = PinholeCamera(512, 512, radians(120.0))
 
 
 class Everywhere:
@@ -307,9 +308,9 @@ class Everywhere:
 def polar_orbit(tmp_path_factory):
     """One revolution over the poles, a state every 30 s."""
     time_s = np.arange(0.0, PERIOD_S, 30.0)
-    angle = 2.0 * math.pi * time_s / PERIOD_S
+    angle = 2.0 * pi * time_s / PERIOD_S
     position = RADIUS_M * np.stack([np.cos(angle), np.zeros_like(angle), np.sin(angle)], axis=1)
-    speed = 2.0 * math.pi * RADIUS_M / PERIOD_S
+    speed = 2.0 * pi * RADIUS_M / PERIOD_S
     velocity = speed * np.stack([-np.sin(angle), np.zeros_like(angle), np.cos(angle)], axis=1)
     # Over the Moon's poles, not over the Earth's; the Moon turns by a degree meanwhile.
     icrf_from_mcmf = IauOrientation().mcmf_from_icrf(tdb_s_from_utc_ns(START)).T
@@ -416,7 +417,7 @@ def test_places_are_ordered_so_that_neighbours_on_the_ground_follow_each_other()
     """53 revolutions, each 0.3 degrees west of the one before, low on the way north and high on the way south."""
     step = np.arange(20_000)
     latitude = 0.8 * np.sin(step / 60.0)
-    longitude = -step / 377.0 * math.radians(0.3)
+    longitude = -step / 377.0 * radians(0.3)
     altitude_m = np.where(np.cos(step / 60.0) > 0.0, 14e3, 48e3)
     order = order_by_ground(np.asarray(mcmf_from_spherical(latitude, longitude, altitude_m)), CAMERA, Everywhere())
     assert np.array_equal(np.sort(order), step)

@@ -5,6 +5,7 @@ import shutil
 from pathlib import Path
 
 import numpy as np
+from numpy.random import default_rng
 from numpy.testing import assert_allclose, assert_array_equal
 from pycocotools.coco import COCO
 from pycocotools.cocoeval import COCOeval
@@ -303,7 +304,7 @@ def test_a_spot_lands_where_the_label_says(sun, seed):
     u, v = np.array([250.0, 330.0]), np.array([200.0, 280.0])
     crop = make_crop(
         spot_image(u, v), np.array(sun), u, v, np.full(2, 20.0), np.array([True, True]), 384, QUIET,
-        np.random.default_rng(seed),
+        default_rng(seed),
     )  # fmt: skip
     for x, y in zip(crop.u_px, crop.v_px, strict=True):
         if not (12 < x < 371 and 12 < y < 371):
@@ -322,7 +323,7 @@ def test_the_sun_is_at_the_top_of_every_crop_and_one_seed_gives_one_crop():
     assert bright_right[:, -1].mean() > bright_right[:, 0].mean()
     crop = make_crop(
         bright_right, np.array([1.0, 0.0, 0.0]), np.zeros(0), np.zeros(0), np.zeros(0), np.zeros(0, bool), 384,
-        QUIET, np.random.default_rng(3),
+        QUIET, default_rng(3),
     )  # fmt: skip
     assert crop.image[:40].mean() > crop.image[-40:].mean() + 0.5
     image = spot_image([100, 300], [100, 300])
@@ -330,7 +331,7 @@ def test_the_sun_is_at_the_top_of_every_crop_and_one_seed_gives_one_crop():
         image, np.array([0.0, -1.0, 0.0]), np.array([100.0]), np.array([100.0]), np.array([20.0]), np.array([True]),
         256, AugmentParameters(),
     )  # fmt: skip
-    first, second = (make_crop(*arguments, np.random.default_rng(9)) for _ in range(2))
+    first, second = (make_crop(*arguments, default_rng(9)) for _ in range(2))
     assert np.array_equal(first.image, second.image)
     assert np.array_equal(first.u_px, second.u_px)
 
@@ -347,7 +348,7 @@ def perfect_maps(*places):
 
 
 def test_decoding_the_targets_returns_the_craters():
-    rng = np.random.default_rng(1)
+    rng = default_rng(1)
     u = np.array([20.3, 100.0, 255.5, 333.9, 480.2])
     v = np.array([30.7, 200.1, 255.5, 90.4, 470.9])
     diameter = rng.uniform(12.0, 120.0, 5)
@@ -477,7 +478,7 @@ class Crops:
     """Stands in for the feeder: seeded images of another brightness than unit deviation."""
 
     def batch(self, first, count):
-        rng = np.random.default_rng(first)
+        rng = default_rng(first)
         return {"image": 1.7 * rng.standard_normal((count, 1, 64, 64)).astype(np.float32) + 0.4}
 
 
@@ -496,7 +497,7 @@ def outputs(network, image):
 
 def test_the_restored_network_gives_what_the_exported_one_gives(shipped):
     network, document = restoring.network_from_onnx(shipped)
-    image = np.random.default_rng(1).standard_normal((1, 1, 512, 512)).astype(np.float32)
+    image = default_rng(1).standard_normal((1, 1, 512, 512)).astype(np.float32)
     heat, geometry = outputs(network, image)
     expected = OnnxDetector(shipped.read_bytes()).run_network(image)
     # Single precision through 67 layers: the limit that the export itself holds to.
@@ -538,7 +539,7 @@ def test_an_enlarging_network_gives_maps_of_half_the_stride_and_flies():
     detector = OnnxDetector(model.SerializeToString())
     assert onnx.checker.check_model(model) is None
     assert detector.stride_px == 2
-    image = np.random.default_rng(2).standard_normal((1, 1, 512, 512)).astype(np.float32)
+    image = default_rng(2).standard_normal((1, 1, 512, 512)).astype(np.float32)
     heat, geometry = detector.run_network(image)
     assert heat.shape == (1, 1, 256, 256) and geometry.shape == (1, 5, 256, 256)
     assert_allclose(heat, outputs(network, image)[0], atol=2e-4)
@@ -563,7 +564,7 @@ def test_a_peak_of_a_fine_map_lies_in_the_middle_of_its_cell():
 
 def test_an_enlarging_copy_sees_the_enlarged_image_and_tells_pixels_of_the_image(shipped):
     network, _ = restoring.network_from_onnx(shipped)
-    image = np.random.default_rng(5).standard_normal((1, 1, 128, 128)).astype(np.float32)
+    image = default_rng(5).standard_normal((1, 1, 128, 128)).astype(np.float32)
     large = torch.nn.functional.interpolate(
         torch.from_numpy(image), scale_factor=2.0, mode="bilinear", align_corners=False
     ).numpy()

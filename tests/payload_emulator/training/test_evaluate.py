@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from numpy.random import default_rng
 from pytest import approx, fixture, mark, raises
 
 from payload_emulator.errors import DatasetError, ModelError
@@ -249,7 +250,7 @@ SHARE = 4e-4
 
 def frames(count=12, share=SHARE, depth_said=True, noise=0.0, seed=0):
     """Frames whose detections lie inward of the rims by a share of the depth, as parallax has it."""
-    rng = np.random.default_rng(seed)
+    rng = default_rng(seed)
     pairs = []
     for _ in range(count):
         n = 30
@@ -341,7 +342,7 @@ def test_a_common_shift_is_the_bias_of_its_sun_octant():
 
 
 def test_sigma_is_called_calibrated_where_errors_follow_it():
-    rng = np.random.default_rng(4)
+    rng = default_rng(4)
     u, v = rng.uniform(30, 480, 4000), rng.uniform(30, 480, 4000)
     parts = []
     for k in range(40):
@@ -488,7 +489,7 @@ def test_a_precision_that_rests_on_a_handful_of_detections_decides_nothing():
 
 def scored_frames(count=150, seed=1):
     """Detections far from each other; right with the odds of exp(2 logit(score) + 1 - ln(diameter / 20))."""
-    rng = np.random.default_rng(seed)
+    rng = default_rng(seed)
     truths, found = [], []
     u, v = (part.ravel() for part in np.meshgrid(np.arange(40.0, 500.0, 60.0), np.arange(40.0, 500.0, 60.0)))
     for _ in range(count):
@@ -517,7 +518,7 @@ def test_too_few_detections_are_refused():
 
 def pairs(pull=(0.3, 0.2, 0.4), ground_m=((60.0, -30.0), (-20.0, 10.0)), lasting=1.2, fresh=0.4, seed=2):
     """Craters seen four times under one Sun, with a pull, a registration of two cells, and an error in two parts."""
-    rng = np.random.default_rng(seed)
+    rng = default_rng(seed)
     error, directions, scale, place, crater, size = [], [], [], [], [], []
     for number in range(3_000):
         azimuth = rng.uniform(-np.pi, np.pi)

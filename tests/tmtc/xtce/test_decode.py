@@ -3,9 +3,11 @@
 import math
 import struct
 import warnings
+from math import nan
 
 import numpy as np
 import space_packet_parser as spp
+from numpy.random import default_rng
 from pytest import approx, mark, raises
 
 from tests.tmtc import foreign
@@ -109,7 +111,7 @@ def test_an_independent_interpreter_reads_the_same_values_of_another_mission(see
 
 @mark.parametrize("bits", range(1, 65))
 def test_integers_of_every_width_stand_at_every_place(bits):
-    rng = np.random.default_rng(bits)
+    rng = default_rng(bits)
     types = integer("U", bits) + integer("I", bits, "twosComplement") + integer("PAD", 1)
     for phase in range(8):
         text = layout(types, **{f"P{k}": "PAD" for k in range(phase)}, A="U", B="I")
@@ -173,8 +175,8 @@ def test_a_value_outside_its_spline_is_unknown_and_keeps_its_raw_value_unless_ex
     def read(types):
         return values(layout(types, A="T"), packets)["A"]
 
-    assert read(steps) == approx([math.nan, 1.0, 1.0, 3.0, 3.0, 5.0, math.nan], nan_ok=True)
-    assert read(lines) == approx([math.nan, 1.0, 2.8, 3.0, 3.5, 5.0, math.nan], nan_ok=True)
+    assert read(steps) == approx([nan, 1.0, 1.0, 3.0, 3.0, 5.0, nan], nan_ok=True)
+    assert read(lines) == approx([nan, 1.0, 2.8, 3.0, 3.5, 5.0, nan], nan_ok=True)
     assert read(on) == approx([0.8, 1.0, 2.8, 3.0, 3.5, 5.0, 5.1], rel=1e-15)
     found = decoded(layout(lines, A="T"), packets)
     assert found.counts()["decoded"] == 7 and found.values_unknown() == {"A": 2}
@@ -333,7 +335,7 @@ def test_arrays_of_aggregates_follow_their_count_as_in_the_pus_examples_of_yamcs
 
 def test_elements_of_odd_width_begin_anywhere():
     text = layout(integer("N", 5) + integer("E", 11) + array_type("A", "E", dimension("n")), n="N", a="A", z="N")
-    rng = np.random.default_rng(3)
+    rng = default_rng(3)
     rows = [rng.integers(0, 2048, n).tolist() for n in (0, 1, 2, 7, 31)]
     packets = []
     for row in rows:
@@ -541,7 +543,7 @@ def test_an_element_that_its_calibrator_does_not_cover_is_unknown_alone():
     assert verdicts(text, packets) == ["decoded"] * 4
     found = values(text, packets)
     assert found["z"] == [1, 2, 3, 4] and found["a"][0::2] == [[5.0, 10.0], [50.0]]
-    assert found["a"][1] == approx([15.0, math.nan, 20.0], nan_ok=True)
+    assert found["a"][1] == approx([15.0, nan, 20.0], nan_ok=True)
     assert decoded(text, packets).values_unknown() == {"a": 1}
 
 
@@ -555,7 +557,7 @@ def test_every_truncation_of_every_packet_is_a_verdict():
 
 
 def test_noise_is_decoded_or_given_a_verdict_and_never_stops_the_others():
-    rng = np.random.default_rng(4)
+    rng = default_rng(4)
     definition = parse_xtce(foreign.BUS)
     good = foreign.capture(50, 6)
     noise = [space_packet(int(rng.integers(100, 103)), rng.bytes(int(rng.integers(1, 200))), 0) for _ in range(500)]
