@@ -114,8 +114,7 @@ def pytest_collection_modifyitems(config, items):
     """
     moved = _campaigns()
     for item in items:
-        names = {item.nodeid, item.nodeid.partition("[")[0], item.nodeid.partition("::")[0]}
-        if names & moved:
+        if {item.nodeid, item.nodeid.partition("[")[0], item.nodeid.partition("::")[0]} & moved:
             item.add_marker("campaign")
     if config.getoption("resume") and PASSED.exists():
         passed = set(PASSED.read_text().splitlines())

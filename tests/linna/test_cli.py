@@ -56,8 +56,7 @@ def test_an_unknown_command_is_one_line_with_the_nearest_name(capsys):
 
 def test_every_command_has_a_description_and_an_example_and_states_required_options():
     for group in cli.GROUPS:
-        top = command_parser(cli.GROUPS, group)
-        for name, parser in all_commands(top):
+        for name, parser in all_commands(command_parser(cli.GROUPS, group)):
             if name.split()[1] != group:
                 continue
             assert parser.description, name

@@ -64,8 +64,7 @@ def angle_rad(first, second):
     """Angle of the rotation between matrices (..., 3, 3)."""
     difference = first @ np.swapaxes(second, -1, -2)
     off = difference - np.swapaxes(difference, -1, -2)
-    sine = norm(np.stack([off[..., 2, 1], off[..., 0, 2], off[..., 1, 0]]), axis=0) / 2
-    return np.arcsin(np.clip(sine, 0, 1))
+    return np.arcsin(np.clip(norm(np.stack([off[..., 2, 1], off[..., 0, 2], off[..., 1, 0]]), axis=0) / 2, 0, 1))
 
 
 @fixture(scope="module")

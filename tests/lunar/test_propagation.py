@@ -178,8 +178,7 @@ def test_the_transition_matrix_is_the_change_of_the_end_with_the_start(duration_
     )
     end = propagate(EPOCH_S, start[:3], start[3:], duration_s, FULL).state_after(duration_s)
     assert_allclose(np.concatenate([position, velocity]), end, atol=2e-3)  # m, m/s
-    steps = np.array([10.0] * 3 + [0.01] * 3)
-    for column, step in enumerate(steps):
+    for column, step in enumerate(np.array([10.0] * 3 + [0.01] * 3)):
         moved = start + step * np.eye(6)[column] * np.array([[1.0], [-1.0]])
         ends = [propagate(EPOCH_S, m[:3], m[3:], duration_s, FULL).state_after(duration_s) for m in moved]
         slope = (ends[0] - ends[1]) / (2.0 * step)

@@ -52,8 +52,7 @@ def test_where_each_packet_lies_in_the_frames_is_right():
     sender = transmitter(dumps=1, each=60)
     dump = sender.dumps[0]
     length = sender.settings.cadu_length
-    frames = len(dump.cadus) // length
-    for lost in range(frames):
+    for lost in range(len(dump.cadus) // length):
         octets = dump.cadus[: lost * length] + dump.cadus[(lost + 1) * length :]
         whole = {
             packet

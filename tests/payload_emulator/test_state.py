@@ -239,8 +239,7 @@ def test_a_station_sends_a_number_up_once_and_refuses_without_a_contact():
     station = StationPorts("madrid", "127.0.0.1", receive, keeps=True, taken={3})
     station.telecommand.close()
     replies = station.telecommand = Replies()
-    stream = transmission(256, b"abc") + transmission(3, b"known") + transmission(256, b"abc")
-    for octet in stream:
+    for octet in transmission(256, b"abc") + transmission(3, b"known") + transmission(256, b"abc"):
         station._take(1, bytes([octet]))
     assert sent_up == [(256, b"abc")] and replies.sent == [256, 3, 256]
     has_contact[0] = False
@@ -257,8 +256,7 @@ def test_a_station_sends_a_number_up_once_and_refuses_without_a_contact():
 def test_a_session_repeats_the_newer_transmissions_of_its_journal_at_their_times(tmp_path):
     epoch = parse_scenario(SCENARIO).epoch_utc_ns
     journal = tmp_path / "journal"
-    later = JournalEntry(epoch + 10, "madrid", 512, b"later")
-    for entry in (later, JournalEntry(epoch, "madrid", 256, b"now")):
+    for entry in (JournalEntry(epoch + 10, "madrid", 512, b"later"), JournalEntry(epoch, "madrid", 256, b"now")):
         add_to_journal(journal, entry)
     session = LiveSession(*launch(parse_scenario(SCENARIO), DataFolder(None)), keeps=True, journal_file=journal)
     contacts = session.contacts

@@ -107,8 +107,7 @@ def test_recall_is_counted_by_size_and_by_depth_with_the_limits_in_their_groups(
     depth_ratio = np.array([0.08, 0.08, 0.2, 0.0599, 0.06, 0.08, 0.0999, 0.10, 0.2, np.nan])
     catalogue = make_catalogue(np.zeros(10), np.zeros(10), diameter_m, source="test", depth_m=depth_ratio * diameter_m)
     in_image = np.array([7, 6, 4, 5, 5, 9, 4, 8, 5, 10])
-    detected = np.array([7, 1, 4, 2, 1, 9, 4, 3, 5, 0])
-    assert recall_counts(catalogue, np.stack([in_image, detected], axis=1)) == counts(
+    assert recall_counts(catalogue, np.stack([in_image, np.array([7, 1, 4, 2, 1, 9, 4, 3, 5, 0])], axis=1)) == counts(
         (37, 15, 5, 3), (9, 5, 1, 0), (13, 8, 2, 2), (10, 5, 1, 0)
     )
 

@@ -249,8 +249,7 @@ def test_training_frames_keep_sixty_kilometres_from_every_held_out_box(tmp_path,
     make_shard(recipe, shard, tmp_path, str(data_path))
     km_per_degree = 1737.4 * np.pi / 180.0
     for path in (tmp_path / "metadata").glob("*.json"):
-        corners = json.loads(path.read_text())["corners_deg"]
-        for corner in corners:
+        for corner in json.loads(path.read_text())["corners_deg"]:
             for box in shard.source.avoid:
                 middle = 0.5 * (box.west_deg + box.east_deg)
                 east = abs((corner["longitude"] - middle + 180) % 360 - 180) - 0.5 * (box.east_deg - box.west_deg)
