@@ -6,6 +6,7 @@ from math import cos, radians, sin
 import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
+from numpy import isnan, pi
 from numpy.linalg import norm
 from numpy.random import default_rng
 from pytest import approx, mark, raises
@@ -68,7 +69,7 @@ def test_what_a_pixel_sees_projects_back_into_it(latitude, longitude, altitude_m
     position = mcmf_from_spherical(latitude, longitude, altitude_m)
     rotation = nadir_camera_from_mcmf(position)
     point = ground_point_sphere(CAMERA, rotation, position, np.array([u, v]), height_m)
-    if np.isnan(point).any():  # the corners of the image look past the limb from high up
+    if isnan(point).any():  # the corners of the image look past the limb from high up
         assert math.hypot(u - 255.5, v - 255.5) > 255.0
         return
     assert norm(point) == approx(MOON_RADIUS_M + height_m, abs=1e-6)
@@ -77,10 +78,10 @@ def test_what_a_pixel_sees_projects_back_into_it(latitude, longitude, altitude_m
 
 
 def test_points_behind_the_camera_and_rays_past_the_limb_are_nan():
-    assert np.isnan(CAMERA.project([0.0, 0.0, -1.0])).all()
+    assert isnan(CAMERA.project([0.0, 0.0, -1.0])).all()
     position = mcmf_from_spherical(0.0, 0.0, 30e3)
     level = np.cross(position / norm(position), [0, 0, 1.0])
-    assert np.isnan(intersect_sphere(position, np.stack([level, position / norm(position)]))).all()
+    assert isnan(intersect_sphere(position, np.stack([level, position / norm(position)]))).all()
 
 
 @given(latitudes, longitudes, altitudes_m, st.floats(0.0, 1.2))
@@ -136,7 +137,7 @@ UNIFORM = paper_density_catalogue(1, uniform=True)
 
 def random_positions(n, seed, low_m=14e3, high_m=48e3):
     rng = default_rng(seed)
-    latitude, longitude = np.arcsin(rng.uniform(-1, 1, n)), rng.uniform(-np.pi, np.pi, n)
+    latitude, longitude = np.arcsin(rng.uniform(-1, 1, n)), rng.uniform(-pi, pi, n)
     return mcmf_from_spherical(latitude, longitude, rng.uniform(low_m, high_m, n))
 
 
@@ -167,7 +168,7 @@ def test_uniform_craters_follow_poisson_in_the_true_footprint():
     normal = (position + range_m[..., None] * rays) / MOON_RADIUS_M
     solid = (rays @ -position / norm(position)) ** 3 / camera.focal_px**2
     area_m2 = np.sum(range_m**2 * solid / np.abs(np.sum(normal * rays, -1)))
-    expected = len(UNIFORM) / (4 * np.pi * MOON_RADIUS_M**2) * area_m2
+    expected = len(UNIFORM) / (4 * pi * MOON_RADIUS_M**2) * area_m2
     for n in (1, 3, 5):
         chance = pdtrc(n - 1, expected)
         # 20,000 overlapping positions over a catalogue of 79,387: three standard errors are 0.02 at most.
@@ -188,7 +189,7 @@ def test_probabilities_grow_with_the_field_of_view_and_none_is_selected_where_no
 
 
 def test_positions_over_regions_that_the_catalogue_leaves_out_do_not_count():
-    west = UNIFORM.longitude_rad > np.pi
+    west = UNIFORM.longitude_rad > pi
     half = UNIFORM.select(west)
     study = study_field_of_view(random_positions(2000, 8), half)
     assert study.positions == 2000

@@ -10,6 +10,7 @@ import numpy as np
 import spiceypy
 from hypothesis import given
 from hypothesis import strategies as st
+from numpy import exp, eye
 from numpy.linalg import norm
 from pytest import approx, fixture, mark, raises
 
@@ -105,7 +106,7 @@ def test_rotations_are_those_of_spice_with_the_same_kernels(frame, de421, spice_
 
 @mark.real_data
 def test_the_kernel_file_gives_the_constant_rotation_that_is_built_in(de421):
-    assert np.max(np.abs(de421.me_from_pa @ PA_FROM_ME_DE421 - np.eye(3))) < 1e-15
+    assert np.max(np.abs(de421.me_from_pa @ PA_FROM_ME_DE421 - eye(3))) < 1e-15
 
 
 def test_the_rotation_from_principal_to_mean_earth_axes_is_that_of_naif_and_of_900_m_on_the_ground():
@@ -156,13 +157,13 @@ def test_spherical_coordinates_survive_cartesian_and_back(latitude, longitude, a
     back = spherical_from_mcmf(mcmf_from_spherical(latitude, longitude, altitude_m))
     assert abs(back[0] - latitude) < 1e-12
     if abs(latitude) < np.pi / 2 - 1e-6:
-        assert abs(np.exp(1j * back[1]) - np.exp(1j * longitude)) < 1e-9
+        assert abs(exp(1j * back[1]) - exp(1j * longitude)) < 1e-9
     assert abs(back[2] - altitude_m) < 1e-8
 
 
 def test_rtn_of_a_circular_equatorial_orbit_points_out_along_and_north():
     rtn = rtn_from_inertial([[1.0, 0, 0], [0, 2.0, 0]], [[0, 1.0, 0], [-1.0, 0, 0]])
-    assert np.allclose(rtn[0], np.eye(3))
+    assert np.allclose(rtn[0], eye(3))
     assert np.allclose(rtn[1], [[0, 1, 0], [-1, 0, 0], [0, 0, 1]])
 
 
@@ -178,7 +179,7 @@ def test_quaternions_are_those_of_spice_and_survive_the_matrix(values):
 
 
 def test_half_turns_have_quaternions_too():
-    for q in np.eye(4)[1:]:
+    for q in eye(4)[1:]:
         assert np.allclose(np.abs(quaternion_from_matrix(matrix_from_quaternion(q))), q)
 
 
@@ -194,7 +195,7 @@ def test_rotations_keep_leading_dimensions_and_are_orthonormal(shape):
     ]
     for rotation in rotations:
         assert rotation.shape == (*shape, 3, 3)
-        assert np.allclose(rotation @ np.swapaxes(rotation, -1, -2), np.eye(3), atol=1e-14)
+        assert np.allclose(rotation @ np.swapaxes(rotation, -1, -2), eye(3), atol=1e-14)
         assert np.allclose(np.linalg.det(rotation), 1.0)
     assert quaternion_from_matrix(rotations[0]).shape == (*shape, 4)
 

@@ -3,6 +3,7 @@
 from dataclasses import replace
 
 import numpy as np
+from numpy import cos, cross, pi, sin
 from numpy.linalg import norm
 from pytest import approx, mark, raises
 
@@ -135,12 +136,12 @@ def circling(hours=4.0):
     times = EPOCH + np.arange(-300, int(3600 * hours) + 300, 10) * 10**9
     toward = np.asarray(earth_position_icrf_m(float(tdb_s_from_utc_ns(EPOCH))))
     u = toward / norm(toward)
-    w = np.cross(u, np.cross([0.0, 0.0, 1.0], u))
+    w = cross(u, cross([0.0, 0.0, 1.0], u))
     w /= norm(w)
     rate = np.sqrt(4.9028e12 / 1.7674e6**3)
     angle = rate * (times - EPOCH)[:, None] / 1e9
-    position = 1.7674e6 * (np.cos(angle) * u + np.sin(angle) * w)
-    return ephemeris_from_states(times, position, 1.7674e6 * rate * (np.cos(angle) * w - np.sin(angle) * u))
+    position = 1.7674e6 * (cos(angle) * u + sin(angle) * w)
+    return ephemeris_from_states(times, position, 1.7674e6 * rate * (cos(angle) * w - sin(angle) * u))
 
 
 def test_contacts_end_behind_the_limb_of_the_moon_once_an_orbit():
@@ -149,7 +150,7 @@ def test_contacts_end_behind_the_limb_of_the_moon_once_an_orbit():
     every = LinkSection(stations=("goldstone", "madrid", "canberra"), minimum_elevation_deg=5.0)
     in_contact, light_s = contacts(ephemeris, times, every)
     # The plane holds the Earth: hidden for the angle 180 deg - 2 acos(R / r), R / r = 1737.4 / 1767.4, of each orbit.
-    hidden = (np.pi - 2.0 * np.arccos(1737.4 / 1767.4)) / (2.0 * np.pi)
+    hidden = (pi - 2.0 * np.arccos(1737.4 / 1767.4)) / (2.0 * pi)
     assert 1.0 - in_contact.mean() == approx(hidden, abs=0.04)
     assert np.all((light_s > 1.1) & (light_s < 1.4))
     always, way_s = contacts(ephemeris, times, LinkSection())

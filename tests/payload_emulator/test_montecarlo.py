@@ -5,6 +5,7 @@ from functools import partial
 
 import numpy as np
 import pytest
+from numpy import cos, cross, degrees, exp, radians
 from numpy.linalg import norm
 from numpy.random import default_rng
 from numpy.testing import assert_allclose, assert_array_equal
@@ -93,7 +94,7 @@ def test_a_common_pixel_bias_hides_from_the_innovations_and_shows_in_the_errors(
 def test_an_attitude_of_a_degree_neither_diverges_nor_lies(case_of):
     # A wide field of view sees its own attitude: with known errors of the sensor (single frame, 20 craters, 30 km) the
     # place is worse by 1.8 without any attitude; a filter has 93 m (median) at 1 degree.
-    noise = float(np.radians(1.0))
+    noise = float(radians(1.0))
     parameters = replace(PARAMETERS, errors=replace(PARAMETERS.errors, attitude_noise_rad=noise))
     case = case_of(100, attitude_noise_rad=noise, attitude_bias_rad=0.0, parameters=parameters)
     runs = [fly(case, seed) for seed in (21, 22, 23, 24)]
@@ -176,7 +177,7 @@ def shipped_consistency(case):
 def test_the_shipped_filter_knows_its_errors(shipped, distorted):
     case = shipped
     if distorted:
-        drawn = CatalogueErrors(regional_sigma_m=(60.0, 60.0, 10.0), regional_rad=np.radians(10.0))
+        drawn = CatalogueErrors(regional_sigma_m=(60.0, 60.0, 10.0), regional_rad=radians(10.0))
         case = replace(shipped, catalogue_errors=drawn)
     result = shipped_consistency(case)
     # Errors that last count once a run: chi-square of 4 x 6 degrees over 4, from SciPy.
@@ -203,14 +204,14 @@ def test_craters_that_the_payload_mapped_are_met_again_and_their_errors_known(mo
 def test_a_regional_shift_has_its_size_and_is_alike_over_its_angle():
     rng = default_rng(5)
     # Pairs of places 30 degrees apart on the equator, and 2 degrees.
-    longitude = np.radians(np.array([0.0, 2.0, 30.0]))
-    draws = np.stack([regional_field(np.zeros(3), longitude, np.radians(30.0), rng) for _ in range(300)])
+    longitude = radians(np.array([0.0, 2.0, 30.0]))
+    draws = np.stack([regional_field(np.zeros(3), longitude, radians(30.0), rng) for _ in range(300)])
     fields = np.swapaxes(draws, 1, 2).reshape(-1, 3)
     # 900 draws: a correlation is known to 0.03; chords of 2 and 30 degrees are 0.067 and 0.989 of the memory.
     assert np.mean(fields**2) == approx(1.0, abs=0.12)
     together = np.corrcoef(fields.T)
-    assert together[0, 1] == approx(np.exp(-0.067), abs=0.06)
-    assert together[0, 2] == approx(np.exp(-0.989), abs=0.12)
+    assert together[0, 1] == approx(exp(-0.067), abs=0.06)
+    assert together[0, 2] == approx(exp(-0.989), abs=0.12)
 
 
 @mark.parametrize("named", [False, True])
@@ -229,7 +230,7 @@ def test_a_scenario_distorts_the_map_that_is_uploaded_by_the_stated_amount(tmp_p
     )
     first, second = np.argsort(one.ids), np.argsort(other.ids)
     north = other.latitude_rad[second] - one.latitude_rad[first]
-    east = np.sin(other.longitude_rad[second] - one.longitude_rad[first]) * np.cos(one.latitude_rad[first])
+    east = np.sin(other.longitude_rad[second] - one.longitude_rad[first]) * cos(one.latitude_rad[first])
     assert MOON_RADIUS_M * np.std(north) == approx(80.0, rel=0.05)
     assert MOON_RADIUS_M * np.std(east) == approx(80.0, rel=0.05)
     assert_array_equal(one.sigma_m[first], other.sigma_m[second])
@@ -241,7 +242,7 @@ def test_slow_errors_wander_with_the_memory_they_are_given():
     values = montecarlo._wandering(np.zeros(2), 0.5, 150.0, elapsed_s, rng)[200:]
     assert np.std(values) == approx(0.5, rel=0.05)
     # Ten steps of 15 s: exp(-1).
-    assert np.mean(values[10:] * values[:-10]) / 0.25 == approx(np.exp(-1.0), abs=0.05)
+    assert np.mean(values[10:] * values[:-10]) / 0.25 == approx(exp(-1.0), abs=0.05)
     still = montecarlo._wandering(np.array([0.3, -0.2]), 0.5, float("inf"), elapsed_s, rng)
     assert_array_equal(still, np.broadcast_to([0.3, -0.2], still.shape))
 
@@ -258,7 +259,7 @@ def test_an_acceleration_that_lasts_moves_the_truth_as_it_should(shipped):
     normal = rtn_from_inertial(here[k, :3], here[k, 3:])[2]
     rate = 2.0 * np.pi / 6_672.0
     # Across the plane the orbit is an oscillator: a / n^2 (1 - cos n t).
-    expected = acceleration / rate**2 * (1.0 - np.cos(rate * 600.0))
+    expected = acceleration / rate**2 * (1.0 - cos(rate * 600.0))
     assert normal @ (there[k, :3] - here[k, :3]) == approx(expected, rel=0.12)
 
 
@@ -277,10 +278,10 @@ def test_tracks_differ_and_draw_their_nodes_where_they_say():
         for seed in range(12):
             drawn = montecarlo._with_drawn_node(case, default_rng((seed, 2)))
             rotation = case.orientation.mcmf_from_icrf(float(tdb_s_from_utc_ns(case.epoch_utc_ns)))
-            normal = rotation @ np.cross(drawn.position_icrf_m, drawn.velocity_icrf_m_s)
-            node = np.cross(axis, normal)
-            longitudes.append(float(np.degrees(np.arctan2(node[1], node[0]))) % 360.0)
-            inclinations[track] = float(np.degrees(np.arccos(normal[2] / norm(normal))))
+            normal = rotation @ cross(drawn.position_icrf_m, drawn.velocity_icrf_m_s)
+            node = cross(axis, normal)
+            longitudes.append(float(degrees(np.arctan2(node[1], node[0]))) % 360.0)
+            inclinations[track] = float(degrees(np.arccos(normal[2] / norm(normal))))
             altitudes[track] = float(norm(drawn.position_icrf_m)) - 1_737.4e3
         spread = np.ptp(longitudes)
         assert spread > 150.0 if track != "limb" else 75.0 <= min(longitudes) <= max(longitudes) <= 105.0

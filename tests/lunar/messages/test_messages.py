@@ -9,6 +9,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 from lxml import etree
+from numpy import cos, sin
 from numpy.random import default_rng
 from numpy.testing import assert_allclose, assert_array_equal
 from pytest import mark, raises
@@ -272,7 +273,7 @@ def test_order_and_direction_of_quaternions_are_as_stated():
 
 def test_an_aem_is_written_as_version_2_or_in_the_old_form_with_continuous_signs():
     angle = np.linspace(0.0, 2.0 * np.pi, 6)
-    q_wxyz = np.stack([np.cos(angle), np.sin(angle), 0 * angle, 0 * angle], axis=1)
+    q_wxyz = np.stack([cos(angle), sin(angle), 0 * angle, 0 * angle], axis=1)
     flipped = AttitudeSegment(attitudes().utc_ns, q_wxyz * np.array([1, -1, -1, 1, -1, 1])[:, None])
     texts = {version: format_aem((flipped,), version) for version in ("1.0", "2.0")}
     assert format_aem((flipped,)) == texts["2.0"]
@@ -411,8 +412,8 @@ def test_an_spk_is_referred_to_the_converter(tmp_path):
 
 
 ANGLE = np.arange(20)[:, None] * 0.3
-POSITION_M = 1_768_180.0 * np.concatenate([np.cos(ANGLE), 0.6 * np.sin(ANGLE), 0.8 * np.sin(ANGLE)], 1)
-VELOCITY_M_S = 1665.0 * np.concatenate([-np.sin(ANGLE), 0.6 * np.cos(ANGLE), 0.8 * np.cos(ANGLE)], 1)
+POSITION_M = 1_768_180.0 * np.concatenate([cos(ANGLE), 0.6 * sin(ANGLE), 0.8 * sin(ANGLE)], 1)
+VELOCITY_M_S = 1665.0 * np.concatenate([-sin(ANGLE), 0.6 * cos(ANGLE), 0.8 * cos(ANGLE)], 1)
 EPHEMERIS = ephemeris_from_states(START + np.arange(20) * 300 * NS + 1, POSITION_M, VELOCITY_M_S)
 
 

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from numpy import cos, diag, sin
 from pytest import approx, raises
 
 from lunar.constants import NS
@@ -99,8 +100,8 @@ META_STOP
 
 def example_ephemeris(n=50, covariances=()):
     angle = np.arange(n) * 30.0 * 2 * np.pi / 6672.0
-    position = 1_768_180.0 * np.stack([np.cos(angle), 0.6 * np.sin(angle), 0.8 * np.sin(angle)], -1)
-    velocity = 1665.0 * np.stack([-np.sin(angle), 0.6 * np.cos(angle), 0.8 * np.cos(angle)], -1)
+    position = 1_768_180.0 * np.stack([cos(angle), 0.6 * sin(angle), 0.8 * sin(angle)], -1)
+    velocity = 1665.0 * np.stack([-sin(angle), 0.6 * cos(angle), 0.8 * cos(angle)], -1)
     utc_ns = START + np.arange(n) * 30 * NS
     later = utc_ns + (n - 1) * 30 * NS
     first = EphemerisSegment(utc_ns, position, velocity, comments=("first", "of two"), covariances=covariances)
@@ -137,7 +138,7 @@ def test_version_3_is_read_with_time_system_covariances_and_segments():
 
 
 def test_what_is_written_is_read_back_to_a_micrometre_with_everything_else_the_same():
-    ephemeris = example_ephemeris(covariances=(Covariance(START, "RTN", np.diag([1.0, 4.0, 9.0, 1e-6, 4e-6, 9e-6])),))
+    ephemeris = example_ephemeris(covariances=(Covariance(START, "RTN", diag([1.0, 4.0, 9.0, 1e-6, 4e-6, 9e-6])),))
     back = parse_oem(format_oem(ephemeris))
     assert_same(back, ephemeris)
     for was, now in zip(ephemeris.segments, back.segments, strict=True):
@@ -160,7 +161,7 @@ def test_the_independent_reader_reads_what_we_write_and_interpolates_to_the_same
     from astropy.time import Time
 
     path = tmp_path / "ours.oem"
-    covariance = Covariance(START, "RTN", np.diag([1.0, 4.0, 9.0, 1e-6, 4e-6, 9e-6]))
+    covariance = Covariance(START, "RTN", diag([1.0, 4.0, 9.0, 1e-6, 4e-6, 9e-6]))
     ephemeris = example_ephemeris(covariances=(covariance,))
     save_oem(ephemeris, path)
     theirs = independent.OrbitEphemerisMessage.open(path)

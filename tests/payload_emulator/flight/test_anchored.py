@@ -3,6 +3,7 @@
 from dataclasses import replace
 
 import numpy as np
+from numpy import degrees, inf
 from numpy.linalg import norm
 from pytest import approx, fixture, mark
 
@@ -112,7 +113,7 @@ def test_the_payload_navigates_by_its_catalogue_and_reads_no_anchor(flight):
     position = flight.rotations[-1] @ flight.states[-1, :3]
     radius = float(norm(position))
     # Sightings here are exact: what is left is the gravity left out of the filter and the weight it gives to it.
-    assert last["latitude_deg"] == approx(np.degrees(np.arcsin(position[2] / radius)), abs=0.003)
+    assert last["latitude_deg"] == approx(degrees(np.arcsin(position[2] / radius)), abs=0.003)
     assert last["altitude_m"] == approx(radius - 1_737_400.0, abs=60.0)
     np.testing.assert_allclose(last["velocity_icrf_m_s"], flight.states[-1, 3:], atol=0.5)
     assert max(last["sigma_rtn_m"]) < 150.0
@@ -132,7 +133,7 @@ def test_a_damaged_table_is_reported_and_every_frame_refused(flight, name):
 
 
 def test_detections_with_numbers_that_are_none_are_passed_over_and_nothing_becomes_nan(flight):
-    bad = np.array([np.nan, np.inf, -np.inf, -5.0, 0.0, 1e300])
+    bad = np.array([np.nan, inf, -inf, -5.0, 0.0, 1e300])
     for k in range(4, 9):
         found = flight.frames[k][1]
         columns = {}
@@ -197,7 +198,7 @@ def test_a_kidnapped_spacecraft_is_back_within_the_frames_allowed(navigation_cas
 def test_farther_than_any_widened_search_the_place_is_found_without_a_prior(navigation_case):
     case = navigation_case(FRAME + 24, kidnap=Kidnap(FRAME, 200e3, announced=False), parameters=PARAMETERS)
     # The part of the Moon about the track, so that a search takes moments.
-    near = np.flatnonzero(np.abs(np.degrees(case.craters.latitude_rad) - about_deg(case)[0]) < 35.0)
+    near = np.flatnonzero(np.abs(degrees(case.craters.latitude_rad) - about_deg(case)[0]) < 35.0)
     case = replace(case, craters=case.craters.select(near[turn_deg(case, near) < 25.0]))
     without = fly(replace(case, parameters=replace(PARAMETERS, lost_frames=10_000)), 1)
     found = fly(replace(case, parameters=replace(PARAMETERS, lost=LostParameters())), 1)
@@ -215,11 +216,11 @@ def about_deg(case):
     model = ForceModel(case.gravity, case.orientation, 10)
     flown = propagate(start, case.position_icrf_m, case.velocity_icrf_m_s, at - start + 1.0, model)
     place = case.orientation.mcmf_from_icrf(at) @ flown.state(at)[:3]
-    return np.degrees([np.arcsin(place[2] / norm(place)), np.arctan2(place[1], place[0])])
+    return degrees([np.arcsin(place[2] / norm(place)), np.arctan2(place[1], place[0])])
 
 
 def turn_deg(case, rows):
-    longitude = np.degrees(case.craters.longitude_rad[rows]) - about_deg(case)[1]
+    longitude = degrees(case.craters.longitude_rad[rows]) - about_deg(case)[1]
     return np.abs(np.mod(longitude + 180.0, 360.0) - 180.0)
 
 

@@ -6,6 +6,7 @@ import json
 import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
+from numpy import cos, hypot, nan, pi, sin
 from numpy.random import default_rng
 from pytest import approx, fixture, mark, raises
 
@@ -55,11 +56,9 @@ def detector():
 @mark.parametrize("azimuth", [0.0, 90.0, 180.0, 270.0])
 def test_fresh_bowls_are_found_where_they_are_whatever_the_sun(detector, azimuth):
     angle = np.radians(azimuth)
-    found = detector.detect(
-        bowl_image(CENTRES, sun_azimuth_deg=azimuth), np.array([np.sin(angle), -np.cos(angle), 0.25])
-    )
+    found = detector.detect(bowl_image(CENTRES, sun_azimuth_deg=azimuth), np.array([sin(angle), -cos(angle), 0.25]))
     for u, v in CENTRES:
-        distance = np.hypot(found.u_px - u, found.v_px - v)
+        distance = hypot(found.u_px - u, found.v_px - v)
         best = int(np.argmin(distance))
         # Four pixels: a fifth of the radius, well inside the matching rule; the network never saw such bowls.
         assert distance[best] < 4.0
@@ -99,7 +98,7 @@ def test_images_of_any_size_are_searched_in_tiles(detector):
     quality, found = detector.examine_any_size(large, np.array([0.0, -1.0, 0.2]))
     assert quality is ImageQuality.OK
     for u, v in CENTRES:
-        assert np.hypot(found.u_px - u - 700, found.v_px - v - 300).min() < 4.0
+        assert hypot(found.u_px - u - 700, found.v_px - v - 300).min() < 4.0
     small_quality, small = detector.examine_any_size(tile[:200, :300])
     assert small_quality is ImageQuality.OK
     assert (small.u_px < 300).all() and (small.v_px < 200).all()
@@ -287,7 +286,7 @@ def test_craters_of_eight_pixels_are_found_at_two_scales(detector):
 
     def found_share(outcome):
         found = outcome.detections
-        return np.mean([(np.hypot(found.u_px - u, found.v_px - v) < 2.5).any() for u, v in centres])
+        return np.mean([(hypot(found.u_px - u, found.v_px - v) < 2.5).any() for u, v in centres])
 
     one = search_picture(detector, image, sun_at_azimuth(0.0))
     two = search_picture(detector, image, sun_at_azimuth(0.0), two_scales=True)
@@ -328,7 +327,7 @@ def test_evidence_comes_from_up_to_four_squares(shape, count):
 def random_detections(count, seed, side):
     rng = default_rng(seed)
     diameter = np.exp(rng.normal(3.0, 0.8, count))
-    diameter[:: max(1, count // 7)] = np.nan
+    diameter[:: max(1, count // 7)] = nan
     return Detections(
         rng.uniform(0, side, count), rng.uniform(0, side, count), diameter, np.sort(rng.uniform(0, 1, count))[::-1],
         np.ones(count)
@@ -352,7 +351,7 @@ def test_memory_does_not_grow_with_the_square_of_the_detections():
 
 def texture(shape=(512, 512, 3), dtype=np.uint8):
     rng = default_rng(0)
-    smooth = 100 + 60 * np.sin(np.arange(shape[1]) / 9.0)[None, :] * np.cos(np.arange(shape[0]) / 7.0)[:, None]
+    smooth = 100 + 60 * sin(np.arange(shape[1]) / 9.0)[None, :] * cos(np.arange(shape[0]) / 7.0)[:, None]
     image = smooth + rng.normal(0, 4, shape[:2])
     if len(shape) == 3:
         image = np.repeat(image[..., None], shape[2], axis=2)
@@ -399,7 +398,7 @@ def test_half_the_exposure_gives_the_same_input():
         (np.full((512, 512, 3), 255, np.uint8), ImageQuality.SATURATED),
         (np.full((512, 512), 65535, np.uint16), ImageQuality.SATURATED),
         (np.full((512, 512, 3), 120, np.uint8), ImageQuality.UNIFORM),
-        (np.full((512, 512), np.nan, np.float32), ImageQuality.INVALID),
+        (np.full((512, 512), nan, np.float32), ImageQuality.INVALID),
         (np.zeros((512, 512, 2), np.uint8), ImageQuality.INVALID),
         (np.zeros((0, 0), np.uint8), ImageQuality.INVALID),
         (np.zeros(512, np.uint8), ImageQuality.INVALID),
@@ -419,14 +418,14 @@ def test_gray_levels_round_to_the_nearest_count_and_one_that_is_no_number_is_inv
     assert gray_levels(image).tolist() == [[1, 255, 0]]
 
 
-@given(st.floats(0.0, 2.0 * np.pi))
+@given(st.floats(0.0, 2.0 * pi))
 def test_after_the_turns_the_sun_is_within_45_degrees_of_the_top(azimuth):
-    sun = np.array([np.sin(azimuth), -np.cos(azimuth), 0.3])
+    sun = np.array([sin(azimuth), -cos(azimuth), 0.3])
     turns = sun_up_turns(sun)
     # Follow a point from the middle toward the Sun.
     u, v = turn_forward(np.array([255.5 + 100 * sun[0]]), np.array([255.5 + 100 * sun[1]]), turns, 512, 512)
-    assert 255.5 - v[0] >= 100 * np.cos(np.pi / 4) - 1e-6
-    assert abs(u[0] - 255.5) <= 100 * np.sin(np.pi / 4) + 1e-6
+    assert 255.5 - v[0] >= 100 * cos(pi / 4) - 1e-6
+    assert abs(u[0] - 255.5) <= 100 * sin(pi / 4) + 1e-6
 
 
 @mark.parametrize("turns", [0, 1, 2, 3])
@@ -441,6 +440,6 @@ def test_turned_coordinates_point_at_the_same_pixel_and_come_back(turns):
             assert (back_u[0], back_v[0]) == (column, row)
 
 
-@mark.parametrize("sun", [None, np.array([np.nan, np.nan, np.nan]), np.array([0.0, 0.0, 1.0])])
+@mark.parametrize("sun", [None, np.array([nan, nan, nan]), np.array([0.0, 0.0, 1.0])])
 def test_without_a_sun_direction_the_frame_stays_as_it_is(sun):
     assert sun_up_turns(sun) == 0

@@ -13,6 +13,7 @@ from math import pi, radians
 from pathlib import Path
 
 import numpy as np
+from numpy import cos, hypot, sin
 from numpy.testing import assert_allclose, assert_array_equal
 from pytest import fixture, mark, raises
 
@@ -190,8 +191,8 @@ def test_ellipses_of_coco_lie_in_their_boxes(built):
     for a in annotations:
         u, v, half_major, half_minor, angle_deg = a["ellipse"]
         angle, around = np.radians(angle_deg), np.linspace(0.0, 2.0 * np.pi, 181)
-        x = u + half_major * np.cos(around) * np.cos(angle) - half_minor * np.sin(around) * np.sin(angle) + 0.5
-        y = v + half_major * np.cos(around) * np.sin(angle) + half_minor * np.sin(around) * np.cos(angle) + 0.5
+        x = u + half_major * cos(around) * cos(angle) - half_minor * sin(around) * sin(angle) + 0.5
+        y = v + half_major * cos(around) * sin(angle) + half_minor * sin(around) * cos(angle) + 0.5
         assert half_major >= half_minor > 0.0 and 0.0 < a["visible"] <= 1.0
         left, top, width, height = a["bbox"]
         assert min(left, top) >= 0.0 and max(left + width, top + height) <= RECIPE.width_px + 0.01
@@ -228,7 +229,7 @@ def test_labels_of_fresh_craters_sit_on_dark_and_bright_walls(built):
     contrast = []
     for frame in dataset.frames():
         image = dataset.image(frame).astype(float)
-        toward = frame.sun_camera[:2] / np.hypot(*frame.sun_camera[:2])
+        toward = frame.sun_camera[:2] / hypot(*frame.sun_camera[:2])
         c = frame.craters
         for k in np.flatnonzero((c["depth_ratio"] > 0.08) & (c["diameter_px"] > 12) & (c["id"] >= 0)):
             step = 0.3 * c["diameter_px"][k] * toward
@@ -253,10 +254,10 @@ def test_training_frames_keep_sixty_kilometres_from_every_held_out_box(tmp_path,
             for box in shard.source.avoid:
                 middle = 0.5 * (box.west_deg + box.east_deg)
                 east = abs((corner["longitude"] - middle + 180) % 360 - 180) - 0.5 * (box.east_deg - box.west_deg)
-                east_km = max(east, 0.0) * km_per_degree * np.cos(np.radians(corner["latitude"]))
+                east_km = max(east, 0.0) * km_per_degree * cos(np.radians(corner["latitude"]))
                 north = max(box.south_deg - corner["latitude"], corner["latitude"] - box.north_deg, 0.0)
                 # A parallel is no great circle: up to 1 % short over such distances.
-                assert np.hypot(east_km, north * km_per_degree) >= 59.4
+                assert hypot(east_km, north * km_per_degree) >= 59.4
 
 
 def test_the_renderers_of_a_recipe_get_the_same_scenes_and_an_unknown_one_is_refused(tmp_path):
@@ -308,9 +309,9 @@ def polar_orbit(tmp_path_factory):
     """One revolution over the poles, a state every 30 s."""
     time_s = np.arange(0.0, PERIOD_S, 30.0)
     angle = 2.0 * pi * time_s / PERIOD_S
-    position = RADIUS_M * np.stack([np.cos(angle), np.zeros_like(angle), np.sin(angle)], axis=1)
+    position = RADIUS_M * np.stack([cos(angle), np.zeros_like(angle), sin(angle)], axis=1)
     speed = 2.0 * pi * RADIUS_M / PERIOD_S
-    velocity = speed * np.stack([-np.sin(angle), np.zeros_like(angle), np.cos(angle)], axis=1)
+    velocity = speed * np.stack([-sin(angle), np.zeros_like(angle), cos(angle)], axis=1)
     # Over the Moon's poles, not over the Earth's; the Moon turns by a degree meanwhile.
     icrf_from_mcmf = IauOrientation().mcmf_from_icrf(tdb_s_from_utc_ns(START)).T
     states = position @ icrf_from_mcmf.T, velocity @ icrf_from_mcmf.T
@@ -415,9 +416,9 @@ def test_the_shipped_recipe_of_the_papers_data_set_flies_the_shipped_orbit():
 def test_places_are_ordered_so_that_neighbours_on_the_ground_follow_each_other():
     """53 revolutions, each 0.3 degrees west of the one before, low on the way north and high on the way south."""
     step = np.arange(20_000)
-    latitude = 0.8 * np.sin(step / 60.0)
+    latitude = 0.8 * sin(step / 60.0)
     longitude = -step / 377.0 * radians(0.3)
-    altitude_m = np.where(np.cos(step / 60.0) > 0.0, 14e3, 48e3)
+    altitude_m = np.where(cos(step / 60.0) > 0.0, 14e3, 48e3)
     order = order_by_ground(np.asarray(mcmf_from_spherical(latitude, longitude, altitude_m)), CAMERA, Everywhere())
     assert np.array_equal(np.sort(order), step)
 

@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from numpy import exp, hypot, isnan, log, pi, radians, sqrt
 from numpy.random import default_rng
 from pytest import approx, fixture, mark, raises
 
@@ -202,7 +203,7 @@ def test_a_file_that_holds_no_landmarks_is_refused(tmp_path):
 def shifted_scene(azimuth_deg, shift, number=0):
     """Craters on a grid under a Sun at an image azimuth, every detection off by the same shift (right, down)."""
     u, v = (part.ravel() for part in np.meshgrid(np.arange(60.0, 460.0, 80.0), np.arange(60.0, 460.0, 80.0)))
-    return truth_of(u, v, azimuth=np.radians(azimuth_deg), number=number), found_at(u + shift[0], v + shift[1])
+    return truth_of(u, v, azimuth=radians(azimuth_deg), number=number), found_at(u + shift[0], v + shift[1])
 
 
 def bias_of(*scenes):
@@ -235,7 +236,7 @@ def test_pulls_that_cancel_over_all_suns_remain_in_their_octants():
     # Frames pull in opposite directions: resampling two frames gives anything from -0.3 to 0.3.
     assert overall["interval_95"]["du_px"] == approx([-0.3, 0.3])
     assert octants[0]["interval_95"]["du_px"] == approx([0.3, 0.3])
-    assert octants[2]["pairs"] == 0 and np.isnan(octants[2]["du_px"])
+    assert octants[2]["pairs"] == 0 and isnan(octants[2]["du_px"])
 
 
 def test_octants_of_a_few_craters_name_no_worst_one():
@@ -271,7 +272,7 @@ def test_the_share_put_in_is_the_share_found():
 
 def test_the_standard_error_covers_the_scatter_of_the_fit():
     fits = np.array([fit_parallax(frames(noise=0.5, seed=seed)) for seed in range(12)])
-    assert np.abs(fits[:, 0].mean() - SHARE) < 3 * fits[:, 1].mean() / np.sqrt(12)
+    assert np.abs(fits[:, 0].mean() - SHARE) < 3 * fits[:, 1].mean() / sqrt(12)
     # Twelve fits know their spread to a factor of about 1.5.
     assert fits[:, 0].std() == approx(fits[:, 1].mean(), rel=0.6)
 
@@ -287,7 +288,7 @@ def test_a_network_that_tells_no_depth_is_corrected_on_the_whole():
     share, _ = fit_parallax(frames(depth_said=False))
     truth, found = frames(1, depth_said=False)[0]
     before, after = (
-        np.hypot(one.u_px - truth.u_px, one.v_px - truth.v_px).mean()
+        hypot(one.u_px - truth.u_px, one.v_px - truth.v_px).mean()
         for one in (found, without_parallax(found, share, truth))
     )
     assert after < 0.5 * before
@@ -295,7 +296,7 @@ def test_a_network_that_tells_no_depth_is_corrected_on_the_whole():
 
 def test_too_few_craters_give_no_correction():
     share, error = fit_parallax(frames(1)[:1])
-    assert share == 0.0 and np.isnan(error)
+    assert share == 0.0 and isnan(error)
 
 
 def test_the_papers_threshold_is_chosen_over_its_classes_together():
@@ -335,7 +336,7 @@ def test_groups_hold_their_own_frames_and_no_others():
 
 
 def test_a_common_shift_is_the_bias_of_its_sun_octant():
-    figures = figures_of([scene(*GRID, shift=(0.4, -0.2), azimuth=np.radians(100.0))], [LOW])
+    figures = figures_of([scene(*GRID, shift=(0.4, -0.2), azimuth=radians(100.0))], [LOW])
     biased = [row for row in figures["bias_px_by_sun_octant"] if row["pairs"]]
     assert [row["octant"] for row in biased] == [2]
     assert (biased[0]["du_px"], biased[0]["dv_px"]) == approx((0.4, -0.2))
@@ -444,7 +445,7 @@ def test_a_detection_of_the_wrong_class_is_false_and_its_crater_missed():
 
 def test_nothing_expected_and_nothing_found_gives_no_figure_instead_of_a_perfect_one():
     figures = tally([truth([], [])], [found([], [], [])]).figures(0.5)
-    assert np.isnan([figures.precision, figures.recall, figures.f1, figures.loc_px]).all()
+    assert isnan([figures.precision, figures.recall, figures.f1, figures.loc_px]).all()
 
 
 def test_the_best_threshold_separates_right_from_wrong():
@@ -473,7 +474,7 @@ def test_a_match_is_one_to_one_and_within_reach(detections, craters):
     assert len(set(used.tolist())) == used.size
     for i, k in enumerate(taken):
         if k >= 0:
-            assert np.hypot(du[i] - cu[k], dv[i] - cv[k]) <= 10.0
+            assert hypot(du[i] - cu[k], dv[i] - cv[k]) <= 10.0
 
 
 def test_a_precision_that_rests_on_a_handful_of_detections_decides_nothing():
@@ -493,9 +494,9 @@ def scored_frames(count=150, seed=1):
     truths, found = [], []
     u, v = (part.ravel() for part in np.meshgrid(np.arange(40.0, 500.0, 60.0), np.arange(40.0, 500.0, 60.0)))
     for _ in range(count):
-        diameter = np.exp(rng.uniform(np.log(10.0), np.log(80.0), u.size))
+        diameter = exp(rng.uniform(log(10.0), log(80.0), u.size))
         score = np.sort(rng.uniform(0.1, 0.9, u.size))[::-1]
-        odds = np.exp(2.0 * np.log(score / (1.0 - score)) + 1.0 - np.log(diameter / 20.0))
+        odds = exp(2.0 * log(score / (1.0 - score)) + 1.0 - log(diameter / 20.0))
         right = rng.uniform(size=u.size) < odds / (1.0 + odds)
         found.append(found_at(u, v, diameter, 8e3, score))
         truths.append(truth_of(u[right], v[right], diameter[right], diameter_m=8e3))
@@ -505,9 +506,9 @@ def scored_frames(count=150, seed=1):
 def test_the_odds_put_in_are_the_odds_found():
     model = fit_score(*scored_frames())
     assert model.slope == approx(2.0, rel=0.1)
-    offset = np.interp(np.log([14.0, 20.0, 40.0]), model.log_diameter_px, model.offset)
+    offset = np.interp(log([14.0, 20.0, 40.0]), model.log_diameter_px, model.offset)
     # Some 10,000 detections: the standard error of an offset is about 0.08.
-    assert offset == approx(1.0 - np.log(np.array([14.0, 20.0, 40.0]) / 20.0), abs=0.3)
+    assert offset == approx(1.0 - log(np.array([14.0, 20.0, 40.0]) / 20.0), abs=0.3)
     assert model.probability(np.array([0.5]), np.array([20.0]))[0] == approx(np.e / (1.0 + np.e), abs=0.05)
 
 
@@ -521,9 +522,9 @@ def pairs(pull=(0.3, 0.2, 0.4), ground_m=((60.0, -30.0), (-20.0, 10.0)), lasting
     rng = default_rng(seed)
     error, directions, scale, place, crater, size = [], [], [], [], [], []
     for number in range(3_000):
-        azimuth = rng.uniform(-np.pi, np.pi)
+        azimuth = rng.uniform(-pi, pi)
         sun = np.array([np.sin(azimuth), -np.cos(azimuth), -0.2])
-        diameter = float(np.exp(rng.uniform(np.log(10.0), np.log(60.0))))
+        diameter = float(exp(rng.uniform(log(10.0), log(60.0))))
         cell, m_per_px = number % 2, rng.uniform(100.0, 300.0)
         own = lasting * diameter / 20.0 * rng.standard_normal(2)
         toward = sun_directions(np.array([diameter]), sun)[0]
@@ -535,10 +536,10 @@ def pairs(pull=(0.3, 0.2, 0.4), ground_m=((60.0, -30.0), (-20.0, 10.0)), lasting
             scale.append(m_per_px)
             place.append(cell)
             crater.append(number)
-            size.append(np.log(diameter / 20.0))
+            size.append(log(diameter / 20.0))
     count = len(error)
     one = np.ones(count)
-    features = np.stack([one, np.array(size), np.log(1.5) * one, one, 1.7 * one, rng.uniform(0, 1.4, count)], axis=1)
+    features = np.stack([one, np.array(size), log(1.5) * one, one, 1.7 * one, rng.uniform(0, 1.4, count)], axis=1)
     return Pairs(np.array(error), features, np.array(directions), np.array(scale), np.array(place), np.array(crater))
 
 
@@ -560,10 +561,10 @@ def test_lasting_and_fresh_errors_are_separated():
     residual, _ = fit_sun(every)
     model, evidence = fit_sigma(replace(every, error_px=residual))
     for size in (-0.5, 0.0, 0.8):
-        total, fresh = model.variances_px2(np.array([[1.0, size, np.log(1.5), 1.0, 1.7, 0.5]]))
-        lasting = 1.2 * np.exp(size)
-        assert np.sqrt(fresh[0]) == approx(FRESH_FACTOR * 0.4, rel=0.1)
-        assert np.sqrt(total[0]) == approx(np.hypot(0.4, lasting), rel=0.15)
+        total, fresh = model.variances_px2(np.array([[1.0, size, log(1.5), 1.0, 1.7, 0.5]]))
+        lasting = 1.2 * exp(size)
+        assert sqrt(fresh[0]) == approx(FRESH_FACTOR * 0.4, rel=0.1)
+        assert sqrt(total[0]) == approx(hypot(0.4, lasting), rel=0.15)
     assert evidence["mean_square_over_variance"] == approx(1.0, abs=0.05)
 
 
