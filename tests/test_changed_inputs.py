@@ -10,7 +10,6 @@ import contextlib
 import csv
 import importlib
 import io
-import json
 import math
 import os
 import re
@@ -20,6 +19,7 @@ import zlib
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import asdict, replace
+from json import dumps, loads
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -341,7 +341,7 @@ def labels():
     image = {"id": 7, "file_name": "a.png", "width": 512, "height": 480, "sun_azimuth_deg": 30.0, "pixel_m": 90.0}
     listed = [{"id": k, "image_id": 7, "category_id": 2 - (k % 3 > 0), "bbox": box} for k, box in enumerate(boxes)]
     kinds = [{"id": 1, "name": "crater"}, {"id": 2, "name": "boulder"}]
-    return json.dumps({"images": [image], "annotations": listed, "categories": kinds})
+    return dumps({"images": [image], "annotations": listed, "categories": kinds})
 
 
 def coco(folder):
@@ -408,7 +408,7 @@ def bus(folder):
 def decoded(path):
     options = ["--xtce", str(path), "--no-error-control", "--prefix-octets", "0"]
     recording = str(path.with_suffix(".bin"))
-    records = json.loads(printed("tm", "decode", recording, *options))
+    records = loads(printed("tm", "decode", recording, *options))
     rows = [[record.get(key) for key in ("VOLTAGE", "OFFSET", "RATE", "STATE")] for record in records]
     states = {"SAFE": 1.0, "ON": 2.0}
     figures = [[states.get(v, v) if isinstance(v, str) else v for v in row] for row in rows]
@@ -455,7 +455,7 @@ def mission_values(path):
 
 def scenario_values(path):
     scenario = load_scenario(path)
-    return leaves(json.loads(json.dumps(asdict(scenario)))), scenario.words
+    return leaves(loads(dumps(asdict(scenario)))), scenario.words
 
 
 def receptions():
@@ -540,9 +540,9 @@ def change(reader, kind, place, new, path):
         octets = value(new, v=np.frombuffer(path.read_bytes(), np.uint8))
         path.write_bytes(np.ascontiguousarray(octets).tobytes())
     else:
-        document = json.loads(path.read_text())
+        document = loads(path.read_text())
         change_tree(document, kind, place, new)
-        path.write_text(json.dumps(document))
+        path.write_text(dumps(document))
 
 
 def change_tree(document, kind, place, new):
@@ -550,7 +550,7 @@ def change_tree(document, kind, place, new):
         *keys, last = [int(key) if key.isdigit() else key for key in place.split("/")]
         for key in keys:
             document = document[key]
-        document[last] = json.loads(new)
+        document[last] = loads(new)
     elif kind == "tree":
         value(new, d=document)
     for item in document["annotations"] if kind == "boxes" else ():

@@ -8,6 +8,7 @@ import numpy as np
 import spiceypy
 from hypothesis import given
 from hypothesis import strategies as st
+from numpy import allclose, array_equal
 from numpy.random import default_rng
 from pytest import approx, fixture, mark, raises
 from scipy.interpolate import KroghInterpolator
@@ -74,8 +75,8 @@ def test_hermite_interpolation_is_that_of_scipy_on_the_same_states(degree):
         middle = nodes.mean()
         theirs = KroghInterpolator(np.repeat(nodes - middle, 2), np.stack([p, v], 1).reshape(-1, 3))
         # Rounding of 1.8e6 m in float64 is 0.2 nm; epochs are rounded to 1 ns = 2 um along track.
-        assert np.allclose(position[k], theirs(t - middle), atol=1e-5)
-        assert np.allclose(velocity[k], theirs.derivative(t - middle), atol=1e-8)
+        assert allclose(position[k], theirs(t - middle), atol=1e-5)
+        assert allclose(velocity[k], theirs.derivative(t - middle), atol=1e-8)
 
 
 def test_hermite_interpolation_is_that_of_spice():
@@ -103,16 +104,16 @@ def test_thirty_second_states_of_a_low_orbit_interpolate_to_micrometres():
 def test_states_come_back_as_they_are_at_their_own_epochs(interpolation):
     ephemeris = arc(IRREGULAR_S, interpolation=interpolation)
     position, velocity = ephemeris.at(ephemeris.utc_ns)
-    assert np.allclose(position, ephemeris.segments[0].position_m, atol=1e-6, rtol=0)
+    assert allclose(position, ephemeris.segments[0].position_m, atol=1e-6, rtol=0)
     if interpolation != "LINEAR":
-        assert np.allclose(velocity, ephemeris.segments[0].velocity_m_s, atol=1e-8, rtol=0)
+        assert allclose(velocity, ephemeris.segments[0].velocity_m_s, atol=1e-8, rtol=0)
 
 
 def test_lagrange_interpolation_of_degree_seven_uses_eight_states():
     found = at_s(arc(np.arange(100) * 30.0, interpolation="LAGRANGE", degree=7), [1500.3])
     # 30 s is 0.028 rad: (w h)^8 / 8! x the product of distances (70) x radius is 0.1 mm at most.
     for mine, expected, atol in zip(found, circle([1500.3]), (1e-3, 1e-5), strict=True):
-        assert np.allclose(mine, expected, atol=atol)
+        assert allclose(mine, expected, atol=atol)
 
 
 @given(st.lists(st.floats(0.0, 3000.0), min_size=1, max_size=40))
@@ -122,7 +123,7 @@ def test_any_order_and_repetition_of_epochs_gives_the_same_states(elapsed):
     together, _ = at_s(ephemeris, elapsed)
     for k, t in enumerate(elapsed):
         alone, _ = at_s(ephemeris, t)
-        assert np.allclose(alone, together[k], atol=1e-8, rtol=0)
+        assert allclose(alone, together[k], atol=1e-8, rtol=0)
 
 
 @mark.parametrize("shape", [(), (0,), (1,), (2, 3)])
@@ -147,7 +148,7 @@ def test_the_useable_interval_is_honoured_and_the_states_beyond_it_still_serve()
     assert (ephemeris.start_utc_ns, ephemeris.stop_utc_ns) == (low, high)
     assert ephemeris.utc_ns[0] == low and ephemeris.utc_ns[-1] == high
     assert ephemeris.covers([low - 1, low, high, high + 1]).tolist() == [False, True, True, False]
-    assert np.array_equal(ephemeris.at(low + NS)[0], whole.at(low + NS)[0])
+    assert array_equal(ephemeris.at(low + NS)[0], whole.at(low + NS)[0])
 
 
 def two_arcs(second_start_s=600.0):
@@ -160,9 +161,9 @@ def test_nothing_is_interpolated_across_the_edge_of_a_segment():
     ephemeris = two_arcs()
     _, before = at_s(ephemeris, 599.999)
     _, after = at_s(ephemeris, [600.0, 600.001])
-    assert np.allclose(before, circle(599.999)[1], atol=1e-6)
+    assert allclose(before, circle(599.999)[1], atol=1e-6)
     # The later segment holds at the shared epoch.
-    assert np.allclose(after[0] - circle(600.0)[1], 5.0, atol=1e-6)
+    assert allclose(after[0] - circle(600.0)[1], 5.0, atol=1e-6)
     assert len(ephemeris.utc_ns) == 41
 
 
@@ -180,7 +181,7 @@ def test_epochs_between_segments_and_in_a_hole_of_their_states_are_refused():
 
 def test_a_lone_state_is_known_at_its_epoch_only():
     ephemeris = arc([0.0])
-    assert np.array_equal(ephemeris.at(START)[0], circle(0.0)[0])
+    assert array_equal(ephemeris.at(START)[0], circle(0.0)[0])
     assert not ephemeris.covers(START + 1)
 
 
@@ -190,7 +191,7 @@ def test_a_leap_second_inside_a_segment_does_no_harm():
     elapsed = np.arange(-300.0, 301.0, 30.0)
     utc_ns = leap + np.rint((elapsed + (elapsed < 0.0)) * NS).astype(np.int64)
     position, _ = ephemeris_from_states(utc_ns, *circle(elapsed)).at(leap + np.array([-9, 15]) * NS)
-    assert np.allclose(position, circle([-10.0, 15.0])[0], atol=1e-4)
+    assert allclose(position, circle([-10.0, 15.0])[0], atol=1e-4)
 
 
 def test_states_that_form_no_segment_and_segments_that_overlap_are_refused():
@@ -432,7 +433,7 @@ def test_every_reading_of_the_onboard_clock_survives_utc_and_back(ticks):
 @mark.parametrize("system", TIME_SYSTEMS)
 def test_every_time_system_of_a_file_converts_there_and_back(system):
     tai_ns = tai_ns_from_utc_ns(parse_utc("2029-08-07T00:00:00") + np.arange(5) * 86_400 * NS)
-    assert np.array_equal(to_tai_ns(from_tai_ns(tai_ns, system), system), tai_ns)
+    assert array_equal(to_tai_ns(from_tai_ns(tai_ns, system), system), tai_ns)
 
 
 def test_gps_time_is_ahead_of_utc_by_18_s_and_arrays_give_arrays_of_the_same_shape():

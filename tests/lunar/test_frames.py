@@ -10,7 +10,7 @@ import numpy as np
 import spiceypy
 from hypothesis import given
 from hypothesis import strategies as st
-from numpy import exp, eye
+from numpy import allclose, count_nonzero, exp, eye
 from numpy.linalg import norm
 from pytest import approx, fixture, mark, raises
 
@@ -133,7 +133,7 @@ def test_mci_has_the_iau_pole_and_its_node_on_the_equator_and_the_bias_of_j2000_
     tdb_s = 934_027_269.183
     mci = mci_from_icrf(tdb_s)
     assert mci.shape == (3, 3)
-    assert np.allclose(mci[2], IauOrientation().mcmf_from_icrf(tdb_s)[2], atol=1e-15)
+    assert allclose(mci[2], IauOrientation().mcmf_from_icrf(tdb_s)[2], atol=1e-15)
     assert abs(mci[0, 2]) < 1e-15  # x lies in the equator of ICRF
     assert np.cross([0, 0, 1.0], mci[2]) @ mci[0] > 0.0  # and is the ascending node
     bias, _, _ = erfa.bp06(2_451_545.0, 0.0)
@@ -149,7 +149,7 @@ def test_enu_is_that_of_pymap3d_on_a_sphere(latitude, longitude):
     place = mcmf_from_spherical(latitude, longitude)
     beyond = place + np.array([300.0, -200.0, 500.0])
     theirs = pymap3d.ecef2enu(*beyond, latitude, longitude, 0.0, ell=ball, deg=False)
-    assert np.allclose(enu_from_mcmf(latitude, longitude) @ (beyond - place), np.array(theirs, dtype=float), atol=1e-6)
+    assert allclose(enu_from_mcmf(latitude, longitude) @ (beyond - place), np.array(theirs, dtype=float), atol=1e-6)
 
 
 @given(latitudes, longitudes, st.floats(-1000.0, 100_000.0))
@@ -163,8 +163,8 @@ def test_spherical_coordinates_survive_cartesian_and_back(latitude, longitude, a
 
 def test_rtn_of_a_circular_equatorial_orbit_points_out_along_and_north():
     rtn = rtn_from_inertial([[1.0, 0, 0], [0, 2.0, 0]], [[0, 1.0, 0], [-1.0, 0, 0]])
-    assert np.allclose(rtn[0], eye(3))
-    assert np.allclose(rtn[1], [[0, 1, 0], [-1, 0, 0], [0, 0, 1]])
+    assert allclose(rtn[0], eye(3))
+    assert allclose(rtn[1], [[0, 1, 0], [-1, 0, 0], [0, 0, 1]])
 
 
 @given(unit_quaternions)
@@ -172,7 +172,7 @@ def test_quaternions_are_those_of_spice_and_survive_the_matrix(values):
     q = np.array(values) / norm(values)
     matrix = matrix_from_quaternion(q)
     # SPICE q2m: v_out = q v q*, scalar first, as here.
-    assert np.allclose(matrix, spiceypy.q2m(q), atol=1e-14)
+    assert allclose(matrix, spiceypy.q2m(q), atol=1e-14)
     back = quaternion_from_matrix(matrix)
     assert back[0] >= 0.0
     assert min(np.abs(back - q).max(), np.abs(back + q).max()) < 1e-12
@@ -180,7 +180,7 @@ def test_quaternions_are_those_of_spice_and_survive_the_matrix(values):
 
 def test_half_turns_have_quaternions_too():
     for q in eye(4)[1:]:
-        assert np.allclose(np.abs(quaternion_from_matrix(matrix_from_quaternion(q))), q)
+        assert allclose(np.abs(quaternion_from_matrix(matrix_from_quaternion(q))), q)
 
 
 @mark.parametrize("shape", [(), (0,), (1,), (2, 3)])
@@ -195,8 +195,8 @@ def test_rotations_keep_leading_dimensions_and_are_orthonormal(shape):
     ]
     for rotation in rotations:
         assert rotation.shape == (*shape, 3, 3)
-        assert np.allclose(rotation @ np.swapaxes(rotation, -1, -2), eye(3), atol=1e-14)
-        assert np.allclose(np.linalg.det(rotation), 1.0)
+        assert allclose(rotation @ np.swapaxes(rotation, -1, -2), eye(3), atol=1e-14)
+        assert allclose(np.linalg.det(rotation), 1.0)
     assert quaternion_from_matrix(rotations[0]).shape == (*shape, 4)
 
 
@@ -351,7 +351,7 @@ def test_the_covered_share_of_a_disc_is_that_of_a_fine_grid(apart, near_radius, 
     disc = x**2 + y**2 <= far_radius**2
     covered = (x - apart) ** 2 + y**2 <= near_radius**2
     # 126,000 grid points inside the disc; its edge blurs a percent of them.
-    assert share == approx(np.count_nonzero(disc & covered) / np.count_nonzero(disc), abs=0.01)
+    assert share == approx(count_nonzero(disc & covered) / count_nonzero(disc), abs=0.01)
 
 
 def test_azimuth_runs_clockwise_from_north_and_the_subsatellite_point_undoes_the_orientation():
@@ -422,13 +422,13 @@ def test_range_and_light_time_are_those_of_the_signal_that_arrives():
     received = START + np.arange(10, 300, 7) * 60 * NS
     received = received[received < ephemeris.stop_utc_ns]
     found = link(ephemeris, received, GOLDSTONE)
-    assert np.allclose(found.range_m, found.light_time_s * SPEED_OF_LIGHT_M_S, rtol=0, atol=1e-3)
+    assert allclose(found.range_m, found.light_time_s * SPEED_OF_LIGHT_M_S, rtol=0, atol=1e-3)
     emitted = received - np.rint(found.light_time_s * NS).astype(np.int64)
     position, _ = ephemeris.at(emitted)
     # Geocentric places of the spacecraft at emission and of the station at reception.
     spacecraft = position - earth_position_icrf_m(tdb_s_from_utc_ns(emitted))
     distance = norm(spacecraft - station_icrf(GOLDSTONE, received)[0], axis=1)
-    assert np.allclose(found.range_m, distance, rtol=0, atol=1e-3)
+    assert allclose(found.range_m, distance, rtol=0, atol=1e-3)
     assert np.all((found.light_time_s > 1.15) & (found.light_time_s < 1.37))
     assert np.array_equal(found.visible, (found.limb_clearance_m > 0) & (found.elevation_rad >= radians(10)))
 
@@ -441,7 +441,7 @@ def test_the_spacecraft_is_behind_the_moon_about_half_of_a_revolution_that_faces
     earth = earth_position_icrf_m(tdb_s_from_utc_ns(epochs))
     geometry = limb_clearance_m(ephemeris.at(epochs)[0], earth) > 0.0
     # Light time shifts the edges by 1.3 s, less than a step.
-    assert np.count_nonzero(found.visible != geometry) <= 4
+    assert count_nonzero(found.visible != geometry) <= 4
     assert 0.4 < np.mean(found.visible) < 0.75
     windows = find_windows(lambda t: link(ephemeris, t).visible, int(epochs[0]), int(epochs[-1]), 30.0, 0.01)
     assert 2 <= len(windows) <= 4

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 from mpmath import atan2, cos, mp, mpf, sin, sqrt
+from numpy import allclose, array_equal
 from numpy.linalg import norm
 from pytest import approx, mark, raises
 
@@ -81,11 +82,11 @@ def test_a_sphere_pulls_as_a_point_mass_and_nothing_happens_at_the_poles():
     pole = np.array([0.0, 0.0, -1.768e6])
     nearby = acceleration(field, pole + np.array([1e-3, 0.0, 0.0]))
     # The gradient is 2e-6 1/s^2: 1 mm away the acceleration differs by 2e-9 m/s^2 and no more.
-    assert np.allclose(acceleration(field, pole), nearby, rtol=0.0, atol=4e-9)
+    assert allclose(acceleration(field, pole), nearby, rtol=0.0, atol=4e-9)
     assert np.all(np.isfinite(gradient(field, pole, 20)))
     place = at(12.0, 34.0, 1000.0)
     expected = -4.9028e12 * place / norm(place) ** 3
-    assert np.allclose(acceleration(kaula_field(5), place, 0), expected, rtol=1e-15)
+    assert allclose(acceleration(kaula_field(5), place, 0), expected, rtol=1e-15)
 
 
 def test_oblateness_pulls_as_in_the_closed_form():
@@ -99,7 +100,7 @@ def test_oblateness_pulls_as_in_the_closed_form():
     k = 5.0 * z * z / r**2
     expected = common * np.array([x * (1 - k), y * (1 - k), z * (3 - k)])
     found = acceleration(GravityField("J2", gm, radius, c, np.zeros((3, 3))), [x, y, z])
-    assert np.allclose(found + gm * np.array([x, y, z]) / r**3, expected, rtol=1e-11, atol=1e-16)
+    assert allclose(found + gm * np.array([x, y, z]) / r**3, expected, rtol=1e-11, atol=1e-16)
 
 
 @mark.parametrize("degree", [0, 1, 2, 8, 40])
@@ -115,8 +116,8 @@ def test_the_gradient_is_the_change_of_the_acceleration(degree):
     )
     found = gradient(field, place, degree)
     # Differences over 20 m: curvature of the field to degree 40 leaves 1e-13, rounding 1e-17 (1/s^2).
-    assert np.allclose(found, expected, rtol=0.0, atol=1e-12)
-    assert np.array_equal(found, found.T)
+    assert allclose(found, expected, rtol=0.0, atol=1e-12)
+    assert array_equal(found, found.T)
     assert abs(np.trace(found)) < 1e-20
 
 
@@ -126,7 +127,7 @@ def test_shapes_are_kept_for_none_one_and_many_positions():
     assert acceleration(field, at(0, 0)).shape == (3,)
     places = np.array([[at(0, 0), at(10, 20)], [at(30, 40), at(50, 60)]])
     assert acceleration(field, places).shape == (2, 2, 3)
-    assert np.array_equal(acceleration(field, places)[1, 0], acceleration(field, at(30, 40)))
+    assert array_equal(acceleration(field, places)[1, 0], acceleration(field, at(30, 40)))
     assert gradient(field, places).shape == (2, 2, 3, 3)
 
 
@@ -148,7 +149,7 @@ def test_the_other_vector_width_gives_the_same_sums(tmp_path):
         found = other.accelerations(other.pack(field.c_bar, field.s_bar, field.gm_m3_s2, field.radius_m), places)
     finally:
         del sys.modules["other_width"]
-    assert np.allclose(found, acceleration(field, places), rtol=1e-14)
+    assert allclose(found, acceleration(field, places), rtol=1e-14)
 
 
 def test_truncation_asks_for_a_degree_the_field_has_and_the_built_in_one_says_what_it_is():

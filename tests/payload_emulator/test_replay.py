@@ -4,6 +4,7 @@ import json
 import re
 import shutil
 from dataclasses import replace
+from json import loads
 
 import numpy as np
 from pytest import approx, fixture, mark, raises
@@ -65,7 +66,7 @@ def copy(archive, tmp_path):
 def restated(folder, change):
     """Write the manifest of an archive again, changed."""
     path = folder / "manifest.json"
-    manifest = json.loads(path.read_text())
+    manifest = loads(path.read_text())
     change(manifest)
     path.write_text(json.dumps(manifest))
 
@@ -85,7 +86,7 @@ def packets_of(name, octets):
 def test_the_service_renders_the_frames_that_an_archive_lacks(copy, tmp_path):
     """Of the files that a scenario can name, the renderer opens only those that the service refuses."""
     shutil.rmtree(copy / "frames")
-    scenario = parse_scenario(json.loads((copy / "manifest.json").read_text())["scenario_toml"])
+    scenario = parse_scenario(loads((copy / "manifest.json").read_text())["scenario_toml"])
     named = replace(
         scenario,
         detector=replace(scenario.detector, network="/nowhere/network.onnx"),
@@ -141,7 +142,7 @@ def test_a_replay_asks_no_clock_for_what_it_says(archive):
 
 def test_costs_are_reported_for_every_frame_and_stay_out_of_the_downlink(archive, tmp_path):
     summary = replay_archive(archive, FlightBuild(), tmp_path / "out")
-    costs = json.loads((tmp_path / "out/performance.json").read_text())
+    costs = loads((tmp_path / "out/performance.json").read_text())
     assert set(costs["stages"]) == {"network", "detector", "navigation"}
     assert all(len(values) == FRAMES for values in costs["stages"].values())
     assert min(value for i, value in enumerate(costs["stages"]["network"]) if i != NO_IMAGE) > 0.0
@@ -163,7 +164,7 @@ def test_an_archive_without_frames_is_rendered_bit_for_bit(copy, archive, tmp_pa
         replay_archive(copy, FlightBuild(), tmp_path / "refused")
     manifest = complete_archive(copy, tmp_path / "whole", DataFolder())
     assert (tmp_path / "whole/frames/000003.png").read_bytes() == (archive / "frames/000003.png").read_bytes()
-    assert set(manifest["files"]) == set(json.loads((archive / "manifest.json").read_text())["files"])
+    assert set(manifest["files"]) == set(loads((archive / "manifest.json").read_text())["files"])
 
 
 def test_a_scenario_that_renders_something_else_is_refused(copy, tmp_path):
@@ -341,7 +342,7 @@ def flown(tmp_path_factory):
 
 
 def inputs(folder):
-    return [json.loads(line) for line in (folder / "payload" / "inputs.jsonl").read_text().splitlines()]
+    return [loads(line) for line in (folder / "payload" / "inputs.jsonl").read_text().splitlines()]
 
 
 def copied(flown, to):
@@ -355,7 +356,7 @@ def test_a_pass_that_is_given_back_shows_the_payload_the_same(flown, tmp_path, c
     out = tmp_path / "again"
     command = ["emulate", "--images", str(flown / "given"), "--evidence", "photographs", "--out", str(out), "--json"]
     assert run(command) == 0
-    summary = json.loads(capsys.readouterr().out)
+    summary = loads(capsys.readouterr().out)
     assert summary["frames"] == summary["frames_kept"] == 3
     assert summary["data"][0].startswith("external images given (000000.png") and summary["warnings"] == []
     first = [item for item in inputs(flown / "pass") if item["frame"] >= 0]

@@ -58,15 +58,13 @@ ROWS = [
 ]
 for row in ROWS:
     row.update(vehicle_id=1, requested_by="ann", arguments={"argument_1": 10.0 + row["id"]})
-LINES = [
-    *(AuditLine("enter", number, "ann") for number in (1, 2, 3, 4)), AuditLine("release", 1, "ann"),
-    AuditLine("send", 1, "bob"), AuditLine("reject", 2, "bob"), AuditLine("release", 3, "bob"),
-]  # fmt: skip
+ENTRIES = "enter 1 ann,enter 2 ann,enter 3 ann,enter 4 ann,release 1 ann,send 1 bob,reject 2 bob,release 3 bob"
+LINES = [AuditLine(kind, int(number), actor) for kind, number, actor in map(str.split, ENTRIES.split(","))]
 
 
 def record_of_clients():
     return Ledger(
-        entered=[Entered(11, 1, "ann"), Entered(12, 2, "ann"), Entered(13, 3, "ann")],
+        entered=[Entered(10 + k, k, "ann") for k in (1, 2, 3)],
         decisions=[
             Decision(1, "released", "ann"),
             Decision(2, "rejected", "bob"),

@@ -55,14 +55,13 @@ def test_every_operation_has_a_request_and_every_request_an_operation(tmp_path):
             assert "{" not in costs.derived(path, described, schemas)[1]
 
 
-@mark.parametrize(
-    "status, memory_mib, processor_s, kept",
-    [
-        (200, 256.0, 10.0, True), (200, 257.0, 1.0, False), (200, 1.0, 10.1, False), (500, 1.0, 1.0, False),
-        (422, 1.0, 1.0, True),
-    ],
-)  # fmt: skip
-def test_a_request_is_judged_by_memory_processor_time_and_status(status, memory_mib, processor_s, kept):
-    cost = costs.Cost("get_status", "", status, memory_mib, 0.0, processor_s)
-    assert (cost.fault == "") is kept
-    assert cost.cells().startswith(f"| `get_status` |  | {status} | {memory_mib:.0f} | 0 |")
+# status, memory in MiB, processor time in s, and whether it is kept
+REQUESTS = "200 256 10 1, 200 257 1 0, 200 1 10.1 0, 500 1 1 0, 422 1 1 1"
+
+
+@mark.parametrize("row", REQUESTS.split(","))
+def test_a_request_is_judged_by_memory_processor_time_and_status(row):
+    status, memory_mib, processor_s, kept = map(float, row.split())
+    cost = costs.Cost("get_status", "", int(status), memory_mib, 0.0, processor_s)
+    assert (cost.fault == "") == kept
+    assert cost.cells().startswith(f"| `get_status` |  | {status:.0f} | {memory_mib:.0f} | 0 |")

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from numpy import cos, diag, sin
+from numpy import allclose, array_equal, cos, diag, sin
 from pytest import approx, raises
 
 from lunar.constants import NS
@@ -118,7 +118,7 @@ def test_version_1_is_read_with_units_frame_bias_comments_and_useable_interval()
     assert format_utc(ephemeris.start_utc_ns) == "2029-08-07T00:01:00.000Z"
     assert format_utc(ephemeris.stop_utc_ns) == "2029-08-07T00:03:00.000Z"
     assert len(segment.utc_ns) == 5
-    assert np.allclose(segment.position_m[1], icrf_from_j2000() @ [1765.2e3, 99.8e3, 16e3], atol=1e-6)
+    assert allclose(segment.position_m[1], icrf_from_j2000() @ [1765.2e3, 99.8e3, 16e3], atol=1e-6)
     # 23 mas: a fifth of a metre at this distance, and not to be lost.
     assert 0.1 < np.linalg.norm(segment.position_m[1] - [1765.2e3, 99.8e3, 16e3]) < 0.3
 
@@ -134,7 +134,7 @@ def test_version_3_is_read_with_time_system_covariances_and_segments():
     assert one.matrix[2, 2] == approx(3.0)  # 3e-6 km2
     assert one.matrix[4, 0] == one.matrix[0, 4] == approx(1e-4)
     assert two.matrix[5, 5] == approx(4e-6)
-    assert np.array_equal(first.velocity_m_s[:, 1], [1665.0, 1662.0])
+    assert array_equal(first.velocity_m_s[:, 1], [1665.0, 1662.0])
 
 
 def test_what_is_written_is_read_back_to_a_micrometre_with_everything_else_the_same():
@@ -142,7 +142,7 @@ def test_what_is_written_is_read_back_to_a_micrometre_with_everything_else_the_s
     back = parse_oem(format_oem(ephemeris))
     assert_same(back, ephemeris)
     for was, now in zip(ephemeris.segments, back.segments, strict=True):
-        assert np.array_equal(was.utc_ns, now.utc_ns)
+        assert array_equal(was.utc_ns, now.utc_ns)
         assert was.useable_stop_utc_ns == now.useable_stop_utc_ns
     assert format_oem(back) == format_oem(parse_oem(format_oem(back)))
 
@@ -152,7 +152,7 @@ def test_every_time_system_keeps_the_epochs_to_the_nanosecond(system):
     utc_ns = START + np.array([0, 1, 123_456_789, 30 * NS])
     states = np.arange(12.0).reshape(4, 3) + 1.0
     ephemeris = Ephemeris((EphemerisSegment(utc_ns, states, states),))
-    assert np.array_equal(parse_oem(format_oem(ephemeris, time_system=system)).utc_ns, utc_ns)
+    assert array_equal(parse_oem(format_oem(ephemeris, time_system=system)).utc_ns, utc_ns)
 
 
 @pytest.mark.filterwarnings("ignore:.*dubious year:erfa.ErfaWarning")
@@ -175,17 +175,17 @@ def test_the_independent_reader_reads_what_we_write_and_interpolates_to_the_same
         for k in (0, 17, -1):
             state = states[k]
             assert state.epoch.isot == format_utc(int(ours.utc_ns[k]), 6).rstrip("Z")
-            assert np.allclose(1e3 * np.array(state.position), ours.position_m[k], atol=1e-6, rtol=0)
-            assert np.allclose(1e3 * np.array(state.velocity), ours.velocity_m_s[k], atol=1e-9, rtol=0)
+            assert allclose(1e3 * np.array(state.position), ours.position_m[k], atol=1e-6, rtol=0)
+            assert allclose(1e3 * np.array(state.velocity), ours.velocity_m_s[k], atol=1e-9, rtol=0)
     (block,) = theirs.segments[0].covariances
     assert block.frame == "RTN"
-    assert np.allclose(block.matrix * 1e6, covariance.matrix, rtol=1e-12)
+    assert allclose(block.matrix * 1e6, covariance.matrix, rtol=1e-12)
     for seconds in (100, 731, 1400):
         state = theirs(Time(format_utc(START + seconds * NS).rstrip("Z"), scale="utc"))
         # The writer's micrometre, and two interpolators' ways of dealing with rounding.
         position, velocity = ephemeris.at(START + seconds * NS)
-        assert np.allclose(1e3 * np.array(state.position), position, atol=1e-4, rtol=0)
-        assert np.allclose(1e3 * np.array(state.velocity), velocity, atol=1e-6, rtol=0)
+        assert allclose(1e3 * np.array(state.position), position, atol=1e-4, rtol=0)
+        assert allclose(1e3 * np.array(state.velocity), velocity, atol=1e-6, rtol=0)
 
 
 @pytest.mark.filterwarnings("ignore:.*dubious year:erfa.ErfaWarning")
@@ -197,9 +197,9 @@ def test_we_read_what_the_independent_writer_writes(tmp_path):
     save_oem(ephemeris, ours)
     independent.OrbitEphemerisMessage.open(ours).save_as(theirs)
     back = load_ephemeris(theirs)
-    assert np.array_equal(back.utc_ns, ephemeris.utc_ns)
+    assert array_equal(back.utc_ns, ephemeris.utc_ns)
     for was, now in zip(ephemeris.segments, back.segments, strict=True):
-        assert np.allclose(was.position_m, now.position_m, atol=1e-3, rtol=0)
+        assert allclose(was.position_m, now.position_m, atol=1e-3, rtol=0)
         assert (was.degree, was.useable_stop_utc_ns) == (now.degree, now.useable_stop_utc_ns)
 
 
@@ -274,7 +274,7 @@ def test_a_line_of_more_than_64_kib_is_refused_before_it_is_parsed(tmp_path):
 
 def test_comments_between_states_are_passed():
     text = replaced("2029-08-07T00:03:00.000Z", "COMMENT CENTER_NAME = EARTH\n2029-08-07T00:03:00.000Z")
-    assert np.array_equal(parse_oem(text).segments[0].position_m, parse_oem(VERSION_1).segments[0].position_m)
+    assert array_equal(parse_oem(text).segments[0].position_m, parse_oem(VERSION_1).segments[0].position_m)
 
 
 def test_an_unknown_frame_and_an_unknown_time_system_are_refused_with_what_is_known(tmp_path):

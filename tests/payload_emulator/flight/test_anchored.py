@@ -3,7 +3,7 @@
 from dataclasses import replace
 
 import numpy as np
-from numpy import degrees, inf
+from numpy import degrees, flatnonzero, inf, isfinite
 from numpy.linalg import norm
 from pytest import approx, fixture, mark
 
@@ -147,7 +147,7 @@ def test_detections_with_numbers_that_are_none_are_passed_over_and_nothing_becom
     packets = flight.fly(flight.payload())
     assert {values["outcome"] for values in named(packets, "frame_outcome")} == {int(Outcome.fixed)}
     for values in named(packets, "filter_estimate"):
-        assert np.all(np.isfinite(values["position_icrf_m"])) and np.all(np.isfinite(values["covariance"]))
+        assert np.all(isfinite(values["position_icrf_m"])) and np.all(isfinite(values["covariance"]))
     position = flight.rotations[-1] @ flight.states[-1, :3]
     assert named(packets, "navigation_state")[-1]["altitude_m"] == approx(float(norm(position)) - 1_737_400.0, abs=60.0)
 
@@ -172,7 +172,7 @@ def test_a_clock_that_jumps_leaves_the_estimate_finite(flight):
     packets = flight.fly(flight.payload())
     assert len(named(packets, "frame_outcome")) == FRAMES
     for values in named(packets, "navigation_state"):
-        assert np.isfinite(values["latitude_deg"]) and np.isfinite(values["altitude_m"])
+        assert isfinite(values["latitude_deg"]) and isfinite(values["altitude_m"])
 
 
 FRAME = 20
@@ -181,7 +181,7 @@ PARAMETERS = AnchoredParameters(gravity_degree=50)
 
 def frames_until_back(run):
     """Frames from the kidnap, itself included, to the first with an error below 500 m; 999 for never."""
-    good = np.flatnonzero(run.error_m[FRAME:] < 500.0)
+    good = flatnonzero(run.error_m[FRAME:] < 500.0)
     return int(good[0]) + 1 if good.size else 999
 
 
@@ -198,7 +198,7 @@ def test_a_kidnapped_spacecraft_is_back_within_the_frames_allowed(navigation_cas
 def test_farther_than_any_widened_search_the_place_is_found_without_a_prior(navigation_case):
     case = navigation_case(FRAME + 24, kidnap=Kidnap(FRAME, 200e3, announced=False), parameters=PARAMETERS)
     # The part of the Moon about the track, so that a search takes moments.
-    near = np.flatnonzero(np.abs(degrees(case.craters.latitude_rad) - about_deg(case)[0]) < 35.0)
+    near = flatnonzero(np.abs(degrees(case.craters.latitude_rad) - about_deg(case)[0]) < 35.0)
     case = replace(case, craters=case.craters.select(near[turn_deg(case, near) < 25.0]))
     without = fly(replace(case, parameters=replace(PARAMETERS, lost_frames=10_000)), 1)
     found = fly(replace(case, parameters=replace(PARAMETERS, lost=LostParameters())), 1)
@@ -229,7 +229,7 @@ def test_a_stale_catalogue_misleads_nobody(navigation_case, wrong_share):
     errors = CatalogueErrors(wrong_share=wrong_share)
     # Without the search of the whole Moon, which takes a second a frame on this map.
     run = fly(navigation_case(40, catalogue_errors=errors, parameters=replace(PARAMETERS, lost_frames=10_000)), 3)
-    assert np.all(np.isfinite(run.error_rtn_m))
+    assert np.all(isfinite(run.error_rtn_m))
     late = slice(20, None)
     if wrong_share < 1.0:
         assert np.median(run.error_m[late]) < 200.0

@@ -76,17 +76,33 @@ def test_turning_the_frame_with_the_sun_turns_the_detections(detector):
     assert turned.v_px == approx(511.0 - reference.u_px, abs=1e-9)
 
 
-@mark.parametrize(
-    "image, verdict",
-    [
-        (np.zeros((512, 512, 3), np.uint8), ImageQuality.DARK),
-        (np.zeros((511, 512, 3), np.uint8), ImageQuality.INVALID),
-        (np.zeros((512, 512, 7), np.uint8), ImageQuality.INVALID),
-        (np.full((512, 512), "x"), ImageQuality.INVALID),
-        (np.full((512, 512), -1, np.int16), ImageQuality.INVALID),
-    ],
-)
-def test_a_bad_frame_is_a_verdict_and_no_detections(detector, image, verdict):
+BAD = """DARK 512,512,3 uint8 0
+INVALID 511,512,3 uint8 0
+INVALID 512,512,7 uint8 0
+INVALID 512,512 U1 0
+INVALID 512,512 int16 -1"""
+UNSEARCHABLE = """DARK 512,512,3 uint8 0
+DARK 512,512,3 uint8 4
+SATURATED 512,512,3 uint8 255
+SATURATED 512,512 uint16 65535
+UNIFORM 512,512,3 uint8 120
+INVALID 512,512 float32 nan
+INVALID 512,512,2 uint8 0
+INVALID 0,0 uint8 0
+INVALID 512 uint8 0
+INVALID 512,512 complex64 0
+INVALID 2,2,2,2 uint8 0"""
+
+
+def verdict_of(row):
+    """Return the verdict of a row, and an image of its shape and type with one value."""
+    verdict, shape, kind, value = row.split()
+    return ImageQuality[verdict], np.full([*map(int, shape.split(","))], float(value)).astype(kind)
+
+
+@mark.parametrize("row", BAD.splitlines())
+def test_a_bad_frame_is_a_verdict_and_no_detections(detector, row):
+    verdict, image = verdict_of(row)
     quality, found = detector.examine(image)
     assert quality is verdict and len(found) == 0
 
@@ -390,23 +406,9 @@ def test_half_the_exposure_gives_the_same_input():
     assert np.abs(prepare_image(bright // 2).gray - reference).max() < 1e-3
 
 
-@mark.parametrize(
-    "image, verdict",
-    [
-        (np.zeros((512, 512, 3), np.uint8), ImageQuality.DARK),
-        (np.full((512, 512, 3), 4, np.uint8), ImageQuality.DARK),
-        (np.full((512, 512, 3), 255, np.uint8), ImageQuality.SATURATED),
-        (np.full((512, 512), 65535, np.uint16), ImageQuality.SATURATED),
-        (np.full((512, 512, 3), 120, np.uint8), ImageQuality.UNIFORM),
-        (np.full((512, 512), nan, np.float32), ImageQuality.INVALID),
-        (np.zeros((512, 512, 2), np.uint8), ImageQuality.INVALID),
-        (np.zeros((0, 0), np.uint8), ImageQuality.INVALID),
-        (np.zeros(512, np.uint8), ImageQuality.INVALID),
-        (np.zeros((512, 512), np.complex64), ImageQuality.INVALID),
-        (np.zeros((2, 2, 2, 2), np.uint8), ImageQuality.INVALID),
-    ],
-)
-def test_a_frame_that_cannot_be_searched_is_a_verdict(image, verdict):
+@mark.parametrize("row", UNSEARCHABLE.splitlines())
+def test_a_frame_that_cannot_be_searched_is_a_verdict(row):
+    verdict, image = verdict_of(row)
     assert prepare_image(image).quality is verdict
 
 

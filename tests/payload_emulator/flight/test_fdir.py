@@ -229,14 +229,17 @@ def test_a_clock_that_jumps_ahead_does_not_release_what_it_has_passed(rig):
     assert not rig.named(packets, "connection_report")
 
 
-@mark.parametrize(
-    "heat_c, drop_v, event, safe",
-    [
-        (52.0, 0.0, "temperature_high", False), (90.0, 0.0, "temperature_high", True),
-        (-50.0, 0.0, "temperature_low", False), (0.0, 2.3, "power_low", False), (0.0, 3.5, "power_low", True)
-    ]
-)  # fmt: skip
-def test_power_and_heat_out_of_limits_are_reported_once_and_end_in_safe_beyond(observing, heat_c, drop_v, event, safe):
+LIMITS = """52 0 temperature_high
+90 0 temperature_high safe
+-50 0 temperature_low
+0 2.3 power_low
+0 3.5 power_low safe"""
+
+
+@mark.parametrize("row", LIMITS.splitlines())
+def test_power_and_heat_out_of_limits_are_reported_once_and_end_in_safe_beyond(observing, row):
+    heat, drop, event, *beyond = row.split()
+    heat_c, drop_v, safe = float(heat), float(drop), bool(beyond)
     observing.board.heat_c, observing.board.drop_v = heat_c, drop_v
     packets = steps(observing, 6)
     assert observing.events(packets).count(event) == 1
