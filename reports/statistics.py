@@ -3,8 +3,6 @@
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass
-from functools import lru_cache
-from statistics import NormalDist
 
 import numpy as np
 from numpy.typing import NDArray
@@ -163,36 +161,10 @@ def _round_step(least: float) -> float:
 
 def chi2_quantile(probability: float, dof: NDArray[np.float64] | float) -> FloatArray:
     """Quantile of chi-squared for each number of degrees of freedom, NaN where that is not positive."""
-    freedom, places = np.unique(dof, return_inverse=True)
-    return np.array([_chi2_quantile(probability, float(k)) for k in freedom])[places].reshape(np.shape(dof))
+    from scipy.special import gammaincinv  # imported here: few commands need it
 
-
-@lru_cache(maxsize=4096)
-def _chi2_quantile(probability: float, freedom: float) -> float:
-    """Solve P(a, x) = probability by Newton's method; the import of SciPy takes longer than all quantiles of a report.
-
-    References
-    ----------
-    Abramowitz and Stegun (1964), 6.5.29 (series of the incomplete gamma function) and 26.4.17 (start value).
-    """
-    if not freedom > 0.0:
-        return math.nan
-    a = 0.5 * freedom
-    root = 1.0 - 1.0 / (9.0 * a) + NormalDist().inv_cdf(probability) / (3.0 * math.sqrt(a))
-    x = a * root**3 if root > 0.3 else math.exp((math.log(probability) + math.lgamma(a + 1.0)) / a)
-    for _ in range(50):
-        term = total = 1.0 / a
-        k = a
-        while term > 1e-17 * total:
-            k += 1.0
-            term *= x / k
-            total += term
-        density = math.exp(a * math.log(x) - x - math.lgamma(a)) / x
-        step = (probability - density * x * total) / density
-        x += max(step, -0.9 * x)
-        if abs(step) < 1e-14 * x:
-            break
-    return 2.0 * x
+    freedom = np.asarray(dof, dtype=np.float64)
+    return np.asarray(2.0 * gammaincinv(np.where(freedom > 0.0, freedom, np.nan) / 2.0, probability))
 
 
 def per_degree(values: FloatArray, dof: FloatArray | IntArray) -> tuple[int, float, float]:

@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 from _pytest.assertion import rewrite
 from hypothesis import settings
+from pytest import fixture, mark
 
 from ground_service import clock
 from tests.cost import TABLE, Cost, read
@@ -93,7 +94,7 @@ def pytest_collection_finish(session):
     gc.enable()
 
 
-@pytest.fixture(scope="session")
+@fixture(scope="session")
 def imported_while_collecting(pytestconfig):
     """The heavy libraries that were imported before the first test."""
     return pytestconfig.stash[IMPORTED]
@@ -113,8 +114,7 @@ def pytest_collection_modifyitems(config, items):
     """
     moved = _campaigns()
     for item in items:
-        names = {item.nodeid, item.nodeid.partition("[")[0], item.nodeid.partition("::")[0]}
-        if names & moved:
+        if {item.nodeid, item.nodeid.partition("[")[0], item.nodeid.partition("::")[0]} & moved:
             item.add_marker("campaign")
     if config.getoption("resume") and PASSED.exists():
         passed = set(PASSED.read_text().splitlines())
@@ -126,7 +126,7 @@ def pytest_collection_modifyitems(config, items):
     items.sort(key=lambda item: (-costs.get(_folder(item.nodeid), 0.0), -sizes[item.path], -slow[item.path]))
     if os.environ.get("LINNA_DATA"):
         return
-    skip = pytest.mark.skip(reason="LINNA_DATA is not set: no real data on this machine")
+    skip = mark.skip(reason="LINNA_DATA is not set: no real data on this machine")
     for item in items:
         if "real_data" in item.keywords:
             item.add_marker(skip)
@@ -161,7 +161,7 @@ def pytest_runtest_call():
     clock.follow_missions(stated)
 
 
-@pytest.fixture(scope="session")
+@fixture(scope="session")
 def data_path():
     """The folder of real data products (only for tests marked real_data)."""
     return Path(os.environ["LINNA_DATA"])

@@ -10,7 +10,6 @@ import contextlib
 import csv
 import importlib
 import io
-import json
 import math
 import os
 import re
@@ -20,11 +19,15 @@ import zlib
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import asdict, replace
+from json import dumps, loads
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
+from numpy.linalg import norm
+from numpy.random import default_rng
+from pytest import mark
 
 from ground_service.errors import GroundError
 from ground_service.missions.ephemerides.service import check_attitudes, load_attitudes
@@ -154,8 +157,8 @@ def orbit_figures(path):
 
 def attitudes(**fields):
     position, velocity = orbit().at(times(ELAPSED_S))
-    down = -position / np.linalg.norm(position, axis=1, keepdims=True)
-    ahead = velocity / np.linalg.norm(velocity, axis=1, keepdims=True)
+    down = -position / norm(position, axis=1, keepdims=True)
+    ahead = velocity / norm(velocity, axis=1, keepdims=True)
     q_wxyz = [quaternion_from_matrix(m) for m in np.stack([np.cross(-ahead, down), -ahead, down], axis=1)]
     return (AttitudeSegment(times(ELAPSED_S), np.array(q_wxyz), **fields),)
 
@@ -175,8 +178,7 @@ def external(folder):
 def pointing(path):
     plain = Scenario("x")
     frames = load_external(path.parent, replace(plain, camera=replace(plain.camera, width_px=64, height_px=64)))
-    ephemeris = load_orbit(frames.ephemeris)
-    check_pointing(ephemeris, frames.attitude_utc_ns, frames.q_wxyz)
+    check_pointing(load_orbit(frames.ephemeris), frames.attitude_utc_ns, frames.q_wxyz)
     found = [(frames.camera_from_icrf(t), float(np.mean(frames.image(t)))) for t in frames.utc_ns.tolist()]
     return np.concatenate([np.append(m, shade) for m, shade in found] + [(frames.utc_ns - START) / NS]), frames.words
 
@@ -246,7 +248,7 @@ LISTS = {
 
 
 def list_text(name, column="id", change="v"):
-    rng = np.random.default_rng(3)
+    rng = default_rng(3)
     diameter_m = 3_000.0 * (1.0 - rng.random(60)) ** -0.5
     columns = dict(
         zip(
@@ -334,12 +336,12 @@ def turned(path):
 
 
 def labels():
-    rng = np.random.default_rng(5)
+    rng = default_rng(5)
     boxes = np.column_stack([rng.uniform(10, 400, (30, 2)), *[rng.uniform(9, 60, 30)] * 2]).tolist()
     image = {"id": 7, "file_name": "a.png", "width": 512, "height": 480, "sun_azimuth_deg": 30.0, "pixel_m": 90.0}
     listed = [{"id": k, "image_id": 7, "category_id": 2 - (k % 3 > 0), "bbox": box} for k, box in enumerate(boxes)]
     kinds = [{"id": 1, "name": "crater"}, {"id": 2, "name": "boulder"}]
-    return json.dumps({"images": [image], "annotations": listed, "categories": kinds})
+    return dumps({"images": [image], "annotations": listed, "categories": kinds})
 
 
 def coco(folder):
@@ -364,7 +366,7 @@ def labelled(path):
 def picture(path, change="a"):
     import cv2
 
-    shades = (np.random.default_rng(2).random((48, 64)) ** 2 * 60_000).astype(np.uint16)
+    shades = (default_rng(2).random((48, 64)) ** 2 * 60_000).astype(np.uint16)
     cv2.imwrite(str(path), np.ascontiguousarray(value(change, a=shades)))
 
 
@@ -406,7 +408,7 @@ def bus(folder):
 def decoded(path):
     options = ["--xtce", str(path), "--no-error-control", "--prefix-octets", "0"]
     recording = str(path.with_suffix(".bin"))
-    records = json.loads(printed("tm", "decode", recording, *options))
+    records = loads(printed("tm", "decode", recording, *options))
     rows = [[record.get(key) for key in ("VOLTAGE", "OFFSET", "RATE", "STATE")] for record in records]
     states = {"SAFE": 1.0, "ON": 2.0}
     figures = [[states.get(v, v) if isinstance(v, str) else v for v in row] for row in rows]
@@ -453,7 +455,7 @@ def mission_values(path):
 
 def scenario_values(path):
     scenario = load_scenario(path)
-    return leaves(json.loads(json.dumps(asdict(scenario)))), scenario.words
+    return leaves(loads(dumps(asdict(scenario)))), scenario.words
 
 
 def receptions():
@@ -538,9 +540,9 @@ def change(reader, kind, place, new, path):
         octets = value(new, v=np.frombuffer(path.read_bytes(), np.uint8))
         path.write_bytes(np.ascontiguousarray(octets).tobytes())
     else:
-        document = json.loads(path.read_text())
+        document = loads(path.read_text())
         change_tree(document, kind, place, new)
-        path.write_text(json.dumps(document))
+        path.write_text(dumps(document))
 
 
 def change_tree(document, kind, place, new):
@@ -548,7 +550,7 @@ def change_tree(document, kind, place, new):
         *keys, last = [int(key) if key.isdigit() else key for key in place.split("/")]
         for key in keys:
             document = document[key]
-        document[last] = json.loads(new)
+        document[last] = loads(new)
     elif kind == "tree":
         value(new, d=document)
     for item in document["annotations"] if kind == "boxes" else ():
@@ -582,7 +584,7 @@ def outcome(name, row, folder):
     return f"SILENT: {np.nanmax(np.abs(before - after)) if before.shape == after.shape else after.shape}"
 
 
-@pytest.mark.parametrize("name", READERS)
+@mark.parametrize("name", READERS)
 def test_a_changed_field_never_gives_other_figures_in_silence(name, tmp_path):
     if name == "orientation kernels" and "LINNA_DATA" not in os.environ:
         pytest.skip("LINNA_DATA is not set: no kernels on this machine")
@@ -629,15 +631,14 @@ def keys_of(code):
     return found | {name for pair in LOOKED_UP.findall(code) for name in pair if name}
 
 
-@pytest.mark.parametrize("section", CODE)
+@mark.parametrize("section", CODE)
 def test_the_table_of_readers_has_the_names_that_the_code_reads_and_no_others(section):
     page = Path(__file__).parents[1] / "docs" / "reference" / "readers.md"
     body = page.read_text().partition(f"\n## {section}\n")[2].partition("\n## ")[0]
     rows = "\n".join(line for line in body.splitlines() if line.startswith("|"))
     stated = {name.casefold() for name in re.findall(r"`(\w[\w ()]*)`", rows)}
     code = code_of(CODE[section])
-    read = {name.casefold() for name in keys_of(code)} - NOT_OF_FILES
-    assert read <= stated
+    assert {name.casefold() for name in keys_of(code)} - NOT_OF_FILES <= stated
     assert {name for name in stated if name not in code.casefold() and " " not in name} == set()
 
 

@@ -9,9 +9,9 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from importlib import metadata
 from pathlib import Path
 
-import pytest
 from packaging.markers import default_environment
 from packaging.requirements import Requirement
+from pytest import fixture, mark
 
 ROOT = Path(__file__).resolve().parent.parent
 
@@ -90,8 +90,8 @@ def needed(python, files):
     return found
 
 
-@pytest.mark.parametrize("python", ["3.11.0", "3.11.2", "3.11.3", "3.12.0"])
-@pytest.mark.parametrize("names", ["runtime", "runtime terrain", "runtime postgres parquet traces oidc objects"])
+@mark.parametrize("python", ["3.11.0", "3.11.2", "3.11.3", "3.12.0"])
+@mark.parametrize("names", ["runtime", "runtime terrain", "runtime postgres parquet traces oidc objects"])
 def test_what_packages_require_is_pinned_for_every_python(names, python):
     """An installation with hashes fails for a package without a pin, also one that only some versions need."""
     files = names.split()
@@ -112,7 +112,7 @@ def test_every_declared_dependency_has_its_pin_also_what_only_older_pythons_need
         assert {name_of(text) for text in EXTRAS[extra]} <= (pins("runtime") | pins(extra)).keys()
 
 
-@pytest.mark.parametrize("name", sorted(name for name, pin in RUNTIME.items() if applies(pin)))
+@mark.parametrize("name", sorted(name for name, pin in RUNTIME.items() if applies(pin)))
 def test_what_runs_is_what_was_pinned_and_may_be_carried(name):
     found = metadata.distribution(name)
     assert version_of(RUNTIME[name]) == found.version
@@ -123,7 +123,7 @@ def test_what_runs_is_what_was_pinned_and_may_be_carried(name):
 HASHED = ["runtime", "postgres", "parquet", "traces", "oidc", "objects", "terrain", "exports", "site"]
 
 
-@pytest.mark.parametrize("name", HASHED)
+@mark.parametrize("name", HASHED)
 def test_the_requirements_with_hashes_are_the_same_versions(name):
     text = (ROOT / "requirements" / "hashed" / f"{name}.txt").read_text().replace("\\\n", " ")
     entries = {name_of(line): line for line in text.splitlines() if line and not line.startswith("#")}
@@ -180,7 +180,7 @@ class Osv(BaseHTTPRequestHandler):
     def log_message(self, *_): ...
 
 
-@pytest.fixture
+@fixture
 def osv():
     with ThreadingHTTPServer(("127.0.0.1", 0), Osv) as server:
         thread = threading.Thread(target=server.serve_forever)

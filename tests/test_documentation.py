@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 import yaml
 from PIL import Image
+from pytest import approx, fixture, raises
 
 import docs_site
 from ground_service.web import pages
@@ -35,7 +36,7 @@ MARK = re.compile(
 )
 
 
-@pytest.fixture(scope="session")
+@fixture(scope="session")
 def site(tmp_path_factory):
     folder = tmp_path_factory.mktemp("site")
     built = subprocess.run(
@@ -74,7 +75,7 @@ def test_the_service_shows_the_site_under_its_policy(site, monkeypatch):
     inline = re.findall(rb"<script>(.*?)</script>", bytes(answer.body), re.DOTALL)
     assert inline and policy.count("'sha256-") == len(set(inline)) and "script-src 'self' 'unsafe" not in policy
     for path in ("../pages.py", "no.html", "/etc/passwd"):
-        with pytest.raises(pages.NotFound):
+        with raises(pages.NotFound):
             pages.documentation_file(path)
 
 
@@ -176,7 +177,7 @@ def test_the_commands_of_a_tutorial_run_as_written(name, tmp_path):
             re.search(r"^fail: recall falls by ([\d.]+) .*$", text, re.MULTILINE)
             for text in (read(f"tutorials/{name}"), printed)
         )
-        assert stated and found and float(found[1]) == pytest.approx(float(stated[1]), abs=0.02)
+        assert stated and found and float(found[1]) == approx(float(stated[1]), abs=0.02)
         assert re.sub(r"[\d.]+", "1", found[0]) == re.sub(r"[\d.]+", "1", stated[0])
 
 
@@ -237,8 +238,7 @@ def test_figures_of_pages_are_those_of_the_program():
 def test_the_animation_of_the_readme_shows_the_figures_of_the_text():
     with Image.open(DOCS / "pictures" / "tour.gif") as picture:
         shown = picture.info["comment"].decode()
-    stated = read("tutorials/first-pass.md").split("```text\n")[1].split("```")[0].strip()
-    assert shown == stated
+    assert shown == read("tutorials/first-pass.md").split("```text\n")[1].split("```")[0].strip()
     median, p95, level = re.findall(r"^anchored +(\d+) +(\d+) .*level (\d)", shown, re.MULTILINE | re.DOTALL)[0]
     navigation = read("navigation.md")
     assert f"| `linna demo` with `LINNA_DATA`, one window | {level} | {median} m | {p95} m |" in navigation

@@ -12,7 +12,7 @@ from types import SimpleNamespace
 from unittest.mock import Mock
 
 import numpy as np
-import pytest
+from pytest import approx, fixture, mark, raises
 
 from ground_service.client.local import local_client
 from ground_service.clock import mission_now_ns, set_mission_clock
@@ -49,14 +49,14 @@ NO_DATA = DataFolder(None)
 TERMS = RunTerms(days=0.25, windows_per_day=1, window_s=300.0)
 
 
-@pytest.fixture(scope="module")
+@fixture(scope="module")
 def whole(tmp_path_factory):
     """Folder and figures of a run without a stop."""
     folder = tmp_path_factory.mktemp("whole")
     return folder, run_mission(parse_scenario(SCENARIO), NO_DATA, folder, TERMS, print)
 
 
-@pytest.mark.slow
+@mark.slow
 def test_six_hours_are_planned_flown_received_and_reported_without_a_person(whole):
     folder, figures = whole
     said = []
@@ -72,7 +72,7 @@ def test_six_hours_are_planned_flown_received_and_reported_without_a_person(whol
     with open_ground(folder / "ground") as ground, local_client(ground, "viewer") as client:
         (line,) = [one for one in client.list_correlations(76) if one.in_force]
     assert line.points >= 3 and line.rejected == 0
-    assert line.drift_ppb == pytest.approx(-1e3 * DRIFT_PPM, abs=20.0)
+    assert line.drift_ppb == approx(-1e3 * DRIFT_PPM, abs=20.0)
     assert line.residual_max_ns < 100e3
     # All that was posted is the set-up: catalogue, mission, ephemeris, standing request.
     assert figures["interventions"] == 0 and figures["interventions_list"] == []
@@ -83,16 +83,16 @@ def test_six_hours_are_planned_flown_received_and_reported_without_a_person(whol
     # The same again prints the figures of the run that has ended; other terms need another folder.
     again = run_mission(parse_scenario(SCENARIO), NO_DATA, folder, TERMS, said.append)
     assert again["windows"] == windows and "this run has ended" in said[-1]
-    with pytest.raises(ScenarioError, match="expected a new folder, or the same scenario and options"):
+    with raises(ScenarioError, match="expected a new folder, or the same scenario and options"):
         run_mission(parse_scenario(SCENARIO), NO_DATA, folder, replace(TERMS, days=0.5), said.append)
 
 
 def assert_same_figures(one, other):
     """A report uses the time correlation of its moment: a microsecond of it is 1.6 mm along the track."""
     first, second = figures_of(one), figures_of(other)
-    assert first == pytest.approx(second, rel=0.0, abs=2e-3, nan_ok=True) and len(first) > 50
+    assert first == approx(second, rel=0.0, abs=2e-3, nan_ok=True) and len(first) > 50
     drift = {name: value for name, value in second.items() if name.endswith("drift_percent")}
-    assert {name: first[name] for name in drift} == pytest.approx(drift, rel=0.0, abs=1e-6)
+    assert {name: first[name] for name in drift} == approx(drift, rel=0.0, abs=1e-6)
 
 
 def memory_by_day(folder, days):
@@ -121,7 +121,7 @@ def memory_by_day(folder, days):
     return [one for one in found.values() if max(one[days - 1]) > 100]
 
 
-@pytest.mark.campaign
+@mark.campaign
 def test_the_memory_of_a_simulated_week_ends_within_a_twentieth_of_that_of_its_second_day(tmp_path):
     processes = memory_by_day(tmp_path / "week", 7)
     assert len(processes) == 2
@@ -130,7 +130,7 @@ def test_the_memory_of_a_simulated_week_ends_within_a_twentieth_of_that_of_its_s
         assert max(map(max, days.values())) <= 450
 
 
-@pytest.mark.campaign
+@mark.campaign
 def test_three_spacecraft_of_two_missions_have_the_figures_that_each_has_alone(tmp_path):
     other = commanded_scenario("other", "[clock]\noffset_s = -2.0\n").replace("[orbit]", "[orbit]\nraan_deg = 40.0")
     other = f'spacecraft = "Other"\nspacecraft_id = 78{other}'
@@ -145,11 +145,10 @@ def test_three_spacecraft_of_two_missions_have_the_figures_that_each_has_alone(t
     assert fleet["Second"]["performance"] != fleet["SelenITA"]["performance"]
 
 
-@pytest.mark.campaign
+@mark.campaign
 def test_time_that_does_not_wait_gives_reports_too(tmp_path):
     terms = replace(TERMS, factor=300.0)
-    scenarios = [parse_scenario(text) for text in (SCENARIO, SECOND)]
-    fleet = run_fleet(scenarios, NO_DATA, tmp_path, terms, print)["fleet"]
+    fleet = run_fleet([parse_scenario(text) for text in (SCENARIO, SECOND)], NO_DATA, tmp_path, terms, print)["fleet"]
     for figures in fleet.values():
         assert figures["windows"]["processed"] == figures["reports"] == 1 and figures["packets_lost"] == 0
         assert figures["wall_s"] > 0.25 * 86_400.0 / 300.0
@@ -158,11 +157,11 @@ def test_time_that_does_not_wait_gives_reports_too(tmp_path):
 def test_a_fleet_has_a_new_folder_and_different_spacecraft(tmp_path):
     scenarios = [parse_scenario(text) for text in (SCENARIO, SECOND)]
     (tmp_path / "file").touch()
-    with pytest.raises(ScenarioError, match="expected a new folder for a fleet"):
+    with raises(ScenarioError, match="expected a new folder for a fleet"):
         run_fleet(scenarios, NO_DATA, tmp_path, TERMS, print)
     for second, key in ((SCENARIO, "spacecraft"), (SECOND.replace("77", "76"), "spacecraft_id")):
         fleet = [scenarios[0], parse_scenario(second)]
-        with pytest.raises(ScenarioError, match=f"with different {key}, found"):
+        with raises(ScenarioError, match=f"with different {key}, found"):
             run_fleet(fleet, NO_DATA, tmp_path / "new", TERMS, print)
 
 
@@ -229,12 +228,12 @@ WRONG = """\
 [payload];clock_steps = ['x 1'] | payload.clock_steps: expected HOURS SECONDS"""
 
 
-@pytest.mark.parametrize("row", WRONG.splitlines())
+@mark.parametrize("row", WRONG.splitlines())
 def test_a_wrong_file_of_disturbances_is_refused_in_one_line(tmp_path, row):
     text, message = row.split(" | ")
     path = tmp_path / "disturbed.toml"
     path.write_text(text.replace(";", "\n"))
-    with pytest.raises(ScenarioError) as caught:
+    with raises(ScenarioError) as caught:
         load_disturbances(path).apply(parse_scenario(SCENARIO))
     assert message in str(caught.value) and "\n" not in str(caught.value)
 
@@ -257,8 +256,8 @@ def state(octets):
     return {"kind": "state", "unacknowledged": octets}
 
 
-@pytest.mark.parametrize(
-    ("said", "error"),
+@mark.parametrize(
+    "said, error",
     [
         ([{"kind": "error", "text": "out of memory"}, state(0)], "spacecraft: out of memory"),
         ([state(10)], "expected its state, found its end"),
@@ -269,19 +268,19 @@ def state(octets):
 def test_a_wait_for_stored_telemetry_ends_with_an_error_or_with_all(said, error, monkeypatch):
     monkeypatch.setattr("studies.mission_run.run.SETTLE_S", 0.0 if len(said) == 3 and error else 60.0)
     spacecraft = Mock()
-    with nullcontext() if error is None else pytest.raises(LinkError, match=error):
+    with nullcontext() if error is None else raises(LinkError, match=error):
         MissionRun._wait_acknowledged(spacecraft, iter(said))
     assert {one.args for one in spacecraft.order.call_args_list} == {("state",)}
 
 
-@pytest.mark.parametrize("text", ["", "[]", "{}", '{"posts": [], "unknown": 1}', '{"posts": [1]}', '{"posts": null}'])
+@mark.parametrize("text", ["", "[]", "{}", '{"posts": [], "unknown": 1}', '{"posts": [1]}', '{"posts": null}'])
 def test_the_folder_of_another_version_is_refused_in_one_line(tmp_path, text):
     (tmp_path / "progress.json").write_text(text)
-    with pytest.raises(ScenarioError, match=r"progress.json: expected .* start the run in a new folder$"):
+    with raises(ScenarioError, match=r"progress.json: expected .* start the run in a new folder$"):
         read_progress(tmp_path / "progress.json")
 
 
-@pytest.mark.parametrize(("days", "asked"), [(0.1, 0), (0.5, 2), (1.0, 2), (1.2, 4), (30.0, 60)])
+@mark.parametrize("days, asked", [(0.1, 0), (0.5, 2), (1.0, 2), (1.2, 4), (30.0, 60)])
 def test_what_is_asked_for_is_counted_by_the_days_of_the_request(days, asked):
     assert windows_asked(days, 2, 4.0 / 24.0) == asked
 
@@ -337,15 +336,14 @@ def test_a_restored_checkpoint_has_archive_spacecraft_and_progress_of_one_moment
         checkpoints.keep(progress)
     write(3)
     (home / "incoming" / "segment").touch()
-    kept = checkpoints.restore()
-    assert kept.read_text() == snapshot.read_text() == "2"
+    assert checkpoints.restore().read_text() == snapshot.read_text() == "2"
     with closing(sqlite3.connect(home / "linna.db")) as connection:
         assert connection.execute("select number from one").fetchall() == [(1,), (2,)]
     assert not (home / "incoming").exists()
     assert Checkpoints(tmp_path / "other", home, snapshot).restore() is None and not home.exists()
 
 
-@pytest.mark.campaign
+@mark.campaign
 def test_a_stopped_run_continues_and_ends_with_the_same_figures(whole, tmp_path, monkeypatch):
     monkeypatch.setattr("studies.mission_run.run.CHECKPOINT_S", 0.0)
     lines = []
@@ -356,7 +354,7 @@ def test_a_stopped_run_continues_and_ends_with_the_same_figures(whole, tmp_path,
             raise KeyboardInterrupt
 
     folder = tmp_path / "stopped"
-    with pytest.raises(KeyboardInterrupt):
+    with raises(KeyboardInterrupt):
         run_mission(parse_scenario(SCENARIO), NO_DATA, folder, TERMS, stop)
     assert (folder / "checkpoint" / "archive.db").exists()
     monkeypatch.setattr("studies.mission_run.run.CHECKPOINT_S", 3600.0)
@@ -393,8 +391,7 @@ def test_windows_are_requested_where_rasters_and_catalogue_describe_the_ground()
     equator = observed_boxes(flat_terrain(listed, []), 13.0)
     assert equator == [Box(0.0, 15.0, -13.0, 13.0), Box(15.0, 30.0, 32.0, 58.0)]
     # Ground with height rasters alone, also further away from the equator: coarse ones show few craters.
-    covered = observed_boxes(flat_terrain(listed, [(0.0, 0.0), (15.0, 0.0)]), 13.0)
-    assert covered == [Box(0.0, 15.0, 2.0, 28.0)]
+    assert observed_boxes(flat_terrain(listed, [(0.0, 0.0), (15.0, 0.0)]), 13.0) == [Box(0.0, 15.0, 2.0, 28.0)]
     # Part of the height is not enough.
     assert observed_boxes(flat_terrain(listed, [(0.0, 0.0)]), 13.0) == equator
     assert observed_boxes(SimpleNamespace(is_real=False), 13.0) == [Box(-180.0, 180.0, -13.0, 13.0)]
@@ -403,7 +400,7 @@ def test_windows_are_requested_where_rasters_and_catalogue_describe_the_ground()
     assert inside_box(widened, *places).tolist() == [True, True, False]
 
 
-@pytest.mark.parametrize("words", [["--speed", "0"], ["--speed", "quick"], ["--window-min", "0.1"], ["--kill", "1"]])
+@mark.parametrize("words", [["--speed", "0"], ["--speed", "quick"], ["--window-min", "0.1"], ["--kill", "1"]])
 def test_options_that_do_not_fit_are_refused_in_one_line(words, capsys):
     assert cli.run(["mission", "run", "selenita", "--days", "1", *words]) == 2
     assert capsys.readouterr().err.count("\n") == 1

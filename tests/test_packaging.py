@@ -18,10 +18,10 @@ import zipfile
 from functools import cache
 from pathlib import Path
 
-import pytest
 import yaml
 from packaging.requirements import Requirement
 from packaging.specifiers import SpecifierSet
+from pytest import fixture, mark
 
 from linna import __version__
 from tests.ground_service.conftest import free_port
@@ -35,7 +35,7 @@ OUTSIDE = {name: value for name, value in os.environ.items() if name not in TAKE
 SCENARIO_NAMES = sorted(path.name for path in (ROOT / "scenarios").glob("*.toml"))
 
 
-@pytest.fixture(scope="module")
+@fixture(scope="module")
 def built(tmp_path_factory):
     """Folder with wheel and sdist, built from the tracked files and a page where `make docs` writes the site.
 
@@ -89,7 +89,7 @@ ground_service/web/static/site.css ground_service/web/templates/pass.html
 """
 
 
-@pytest.mark.slow
+@mark.slow
 def test_the_wheel_holds_scenarios_models_templates_and_migrations(built):
     (wheel,) = built.glob("*.whl")
     names = set(zipfile.ZipFile(wheel).namelist())
@@ -98,7 +98,7 @@ def test_the_wheel_holds_scenarios_models_templates_and_migrations(built):
     assert not [name for name in names if name.startswith(("tests/", "benchmarks/", "docs/"))]
 
 
-@pytest.mark.slow
+@mark.slow
 def test_the_source_distribution_can_be_built_again(built, tmp_path):
     (sdist,) = built.glob("*.tar.gz")
     with tarfile.open(sdist) as archive:
@@ -107,7 +107,7 @@ def test_the_source_distribution_can_be_built_again(built, tmp_path):
     assert "payload_emulator/flight/models/craters.onnx" in names
 
 
-@pytest.fixture(scope="module")
+@fixture(scope="module")
 def installed(built, tmp_path_factory):
     """Folder `bin` of a new environment into which pip has installed the wheel; it sees the packages of this one."""
     (wheel,) = built.glob("*.whl")
@@ -157,7 +157,7 @@ filter_degree = 8
 """
 
 
-@pytest.mark.slow
+@mark.slow
 def test_the_commands_of_the_tour_run_with_the_installed_wheel(installed, tmp_path):
     """The tour of the README on a short pass; the service answers on a free port."""
     tour = re.findall(r"^linna (?:demo|serve|plan|report) .*$", (ROOT / "README.md").read_text(), re.MULTILINE)
@@ -200,7 +200,7 @@ def test_the_project_has_its_legal_and_citation_files():
     assert citation["version"] == __version__ and citation["cff-version"] == "1.2.0"
 
 
-@pytest.mark.campaign
+@mark.campaign
 def test_the_bill_of_materials_has_hashes_licences_and_the_graph_of_everything_shipped(tmp_path):
     from cyclonedx.schema import SchemaVersion
     from cyclonedx.validation.json import JsonStrictValidator

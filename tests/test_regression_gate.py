@@ -2,7 +2,7 @@
 
 import json
 
-import pytest
+from pytest import fixture
 
 from linna import cli
 from lunar.datafolder import DataFolder
@@ -16,7 +16,7 @@ FRAMES = 8
 """A confined build compiles its kernels in every run, since nothing that it writes is kept."""
 
 
-@pytest.fixture(scope="module")
+@fixture(scope="module")
 def suite(tmp_path_factory):
     folder = tmp_path_factory.mktemp("suite")
     chosen = [str(SUITE / f"{name}.toml") for name in ("paper-light", "faults")]
@@ -24,15 +24,14 @@ def suite(tmp_path_factory):
     return folder
 
 
-@pytest.fixture(scope="module")
+@fixture(scope="module")
 def home(tmp_path_factory):
     return tmp_path_factory.mktemp("service")
 
 
 def regress(suite, home, build, capsys):
     words = ["--archive", str(suite), "--build", build, "--home", str(home), "--json"]
-    status = cli.run(["regress", "run", *words])
-    return status, json.loads(capsys.readouterr().out)
+    return cli.run(["regress", "run", *words]), json.loads(capsys.readouterr().out)
 
 
 def test_the_shipped_network_and_parameters_pass_their_own_suite(suite, home, capsys):

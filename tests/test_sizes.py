@@ -6,7 +6,7 @@ import subprocess
 import sys
 from pathlib import Path
 
-import pytest
+from pytest import mark
 
 _SPEC = importlib.util.spec_from_file_location("sizes", Path(__file__).with_name("sizes.py"))
 sizes = importlib.util.module_from_spec(_SPEC)
@@ -35,8 +35,8 @@ def test_tokens_do_not_count_comments_docstrings_and_line_breaks():
     assert sizes.size_of("a = '''text'''\n")[1] == 3
 
 
-@pytest.mark.parametrize(
-    ("sized", "expected"),
+@mark.parametrize(
+    "sized, expected",
     [
         ((10, 100), []),
         ((9, 101), ["p: 101 tokens, limit 100: remove 1 there, or lower another entry by more"]),
@@ -51,8 +51,8 @@ def test_a_package_that_the_table_does_not_know_is_above_its_limit():
     assert len(sizes.above({"new": (1, 1)}, {"p": (10, 100)})) == 2
 
 
-@pytest.mark.parametrize(
-    ("after", "refused"),
+@mark.parametrize(
+    "after, refused",
     [
         ({"a": (9, 9), "b": (10, 10)}, 0),
         ({"a": (11, 10), "b": (10, 10)}, 1),

@@ -93,7 +93,7 @@ def import_archive(ground: Ground, folder: Path) -> int:
     mission, text = _mission(folder, manifest)
     reference = _readable(load_orbit, folder / "reference.oem", names)
     _readable(load_catalogue, folder / "catalogue.csv", names)
-    receptions = read_receptions(folder / RECEPTIONS_FILE) if RECEPTIONS_FILE in names else None
+    receptions = read_receptions(folder / RECEPTIONS_FILE, 0) if RECEPTIONS_FILE in names else []
     attitudes = attitude_file(names, str(folder))
     if attitudes is not None:
         table = load_attitudes(folder / attitudes, str(folder / attitudes))
@@ -109,7 +109,7 @@ def import_archive(ground: Ground, folder: Path) -> int:
     pass_id = _register(
         ground, folder, manifest, digest, start_utc_ns, stop_utc_ns, stored, images, (mission, text), reference
     )
-    if receptions is not None:
+    if receptions:  # a flight in the range of no station has none
         enter_receptions(
             ground, int(manifest["spacecraft_id"]), instance_of(manifest, digest), receptions, actor="archive"
         )

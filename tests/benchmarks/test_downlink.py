@@ -1,6 +1,6 @@
 """Downlink streams of ground stations: `tm check` and `ingest` find the same packets, all that can be found."""
 
-import pytest
+from pytest import mark
 
 from benchmarks.downlink import STREAMS, checked, ingested, noise_found, weak_everywhere, weak_start
 
@@ -8,7 +8,7 @@ SLOW = {"clean", "weak-100", "weak-220", "weak-400", "weak-middle", "noise-30000
 """Streams of 2,000 frames or 3 MB: the weak start of 60 frames below and `noise-79000` test the same."""
 
 
-@pytest.mark.parametrize("name", [name for name in STREAMS if name not in SLOW])
+@mark.parametrize("name", [name for name in STREAMS if name not in SLOW])
 def test_every_packet_that_can_be_found_is_found_by_check_and_by_ingest(name):
     stream = STREAMS[name]()
     size = sum(len(octets) for octets in stream.files)
@@ -17,7 +17,7 @@ def test_every_packet_that_can_be_found_is_found_by_check_and_by_ingest(name):
     assert (stored.packets, stored.false, stored.octets) == (stream.true, 0, size)
 
 
-@pytest.mark.parametrize("seed", range(6))
+@mark.parametrize("seed", range(6))
 def test_check_and_ingest_agree_where_few_frames_can_be_repaired(seed):
     weak = weak_start(30, frames=60) if seed == 0 else weak_everywhere(6e-3 + 8e-4 * seed, seed)
     assert checked(weak).packets == ingested(weak).packets == weak.true

@@ -5,7 +5,7 @@ import math
 from types import SimpleNamespace
 
 import numpy as np
-import pytest
+from pytest import approx, fixture, mark, raises
 
 from benchmarks import _rows, mutation, mutation_plugin
 from benchmarks.__main__ import NAMES, main
@@ -14,14 +14,14 @@ from benchmarks.render import compare_renderings, thinned
 from payload_emulator.sim.render.renderer import Rendering
 
 
-@pytest.mark.parametrize("name", sorted(mutation.GROUPS))
+@mark.parametrize("name", sorted(mutation.GROUPS))
 def test_a_group_names_modules_and_tests_that_exist(name):
     group = mutation.GROUPS[name]
     assert group.modules and group.tests
     assert [path for path in group.modules + group.tests if not (mutation.ROOT / path).exists()] == []
 
 
-@pytest.mark.parametrize(
+@mark.parametrize(
     "difference",
     [
         "-    a = np.zeros(n, dtype=np.int64)\n+    a = np.zeros(n, dtype=None)",
@@ -35,7 +35,7 @@ def test_element_types_and_wording_are_left_out(difference):
     assert mutation.reason_left_out(difference) is not None
 
 
-@pytest.mark.parametrize(
+@mark.parametrize(
     "difference",
     [
         "-    if a > limit:\n+    if a >= limit:",
@@ -51,7 +51,7 @@ def test_what_decides_is_tested(difference):
     assert mutation.reason_left_out(difference) is None
 
 
-@pytest.fixture
+@fixture
 def state(monkeypatch):
     """Return the records of mutmut, without mutmut."""
     recorded = SimpleNamespace(_stats=set(), duration_by_test={"a": 1.0})
@@ -65,7 +65,7 @@ def set_up(state, name, scope, calls):
     hook = mutation_plugin.pytest_fixture_setup(SimpleNamespace(argname=name, scope=scope))
     next(hook)
     state._stats.update(calls)
-    with pytest.raises(StopIteration):
+    with raises(StopIteration):
         hook.send(None)
 
 
@@ -111,13 +111,13 @@ def rendering(dark_columns, radiance=0.02, size=16):
 def test_shadows_are_counted_over_all_views_and_radiance_is_compared_with_the_mean_of_the_reference():
     found = compare_renderings([rendering(4), rendering(8)], [rendering(6), rendering(8)])
     # 4 of 6 columns and 8 of 8: 12 of 14.
-    assert found.shadow_iou == pytest.approx(12.0 / 14.0)
+    assert found.shadow_iou == approx(12.0 / 14.0)
     assert found.dark_pixels == 14 * 16 and found.views == 2
     found = compare_renderings([rendering(0, 0.02)], [rendering(0, 0.022)])
     # A tenth too bright everywhere: 0.1 sqrt(mean b^2) / mean b for b even from 0.5 to 1.5.
     b = np.linspace(0.5, 1.5, 16)
-    assert found.radiance_rmse == pytest.approx(0.1 * math.sqrt(np.mean(b**2)), rel=1e-4)
-    assert found.correlation == pytest.approx(1.0)
+    assert found.radiance_rmse == approx(0.1 * math.sqrt(np.mean(b**2)), rel=1e-4)
+    assert found.correlation == approx(1.0)
     assert math.isnan(compare_renderings([rendering(0)], [rendering(0)]).shadow_iou)
     assert math.isnan(compare_renderings([], []).correlation)
 
@@ -127,7 +127,7 @@ def test_thinning_takes_the_pixels_that_the_march_takes():
     assert thin.lit.shape == (4, 4) and thin.lit[0].tolist() == [0.0, 1.0, 1.0, 1.0]
 
 
-@pytest.mark.parametrize(("unit", "ratio"), [("packets/s", 2.0), ("s", 0.5), ("packets", 2.0), ("MiB", 0.5)])
+@mark.parametrize("unit, ratio", [("packets/s", 2.0), ("s", 0.5), ("packets", 2.0), ("MiB", 0.5)])
 def test_a_ratio_above_one_is_better_than_the_peer(unit, ratio):
     assert Row("job", 10.0, unit, "peer", 5.0).ratio == ratio
     assert Row("job", 10.0, unit).ratio is None
@@ -137,13 +137,13 @@ def test_a_line_names_the_peer_the_contradiction_and_a_missing_program():
     text = line(Row("job", 10.0, "s", "other program", 5.0, "values differ"))
     assert "0.50 x" in text and "other program: 5" in text and text.endswith("DIFFERENT: values differ")
     assert "no peer" in line(Row("job", 10.0, "s")) and "DIFFERENT" not in line(Row("job", 10.0, "s"))
-    with pytest.raises(NotMeasured, match=r"^Thing is not installed$"):
+    with raises(NotMeasured, match=r"^Thing is not installed$"):
         needs("Thing", "no-such-program-1", "no-such-program-2")
     assert needs("a shell", "no-such-program-1", "sh").endswith("sh")
 
 
-@pytest.mark.parametrize(
-    ("rows", "fault", "status"),
+@mark.parametrize(
+    "rows, fault, status",
     [
         ([Row("job", 1.0, "s")], "", 0), ([], "not measured: Chromium is not installed", 0),
         ([Row("job", 1.0, "s", wrong="values differ")], "", 1), ([], "exit status 1", 1),

@@ -2,7 +2,7 @@
 
 from graphlib import CycleError
 
-import pytest
+from pytest import raises
 
 from benchmarks import _rows
 from benchmarks.__main__ import main
@@ -19,7 +19,7 @@ MODULES = {
 def test_rooms_and_arrows_are_those_of_the_imports_and_a_circle_is_refused():
     """attic → hall → cellar, and attic → cellar inside a function; 7 of 12 lines import."""
     assert measure("house", MODULES) == Rooms(3, 3, 3, 6, 12, 7 / 12)
-    with pytest.raises(CycleError, match="cycle"):
+    with raises(CycleError, match="cycle"):
         measure("house", MODULES | {"house.cellar": "from house import attic\n"})
 
 

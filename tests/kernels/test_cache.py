@@ -10,7 +10,6 @@ import time
 from pathlib import Path
 from unittest.mock import MagicMock
 
-import pytest
 from pytest import fixture, mark
 
 from kernels import KEPT_S, keep, kept, memory
@@ -184,8 +183,8 @@ def dependencies(module):
     return {name: getattr(module, name)._cache._dependencies for name in KERNELS}
 
 
-@pytest.mark.parametrize(
-    ("old", "new", "changed"),
+@mark.parametrize(
+    "old, new, changed",
     [
         ("STEP = 1", "STEP = 2", {"outer"}), ("by=1", "by=2", {"outer"}),
         ('"nsz", "contract"', '"nsz", "arcp"', {"outer"}), ("@njit\n", "@njit(error_model='numpy')\n", {"outer"}),

@@ -2,12 +2,12 @@
 
 import json
 
-import pytest
+from pytest import fixture
 
 from linna.cli import run
 
 
-@pytest.fixture
+@fixture
 def typed(capsys):
     """Run a command line that ends with a status; return its document or text, or the one line of its refusal."""
 

@@ -44,12 +44,12 @@ def test_a_downlinked_map_is_compared_with_a_catalogue(tmp_path, typed):
     assert figures["median_horizontal_m"] == pytest.approx(303.2, abs=1.0)
 
 
-def test_a_downlink_without_a_map_has_none(tmp_path, typed):
+def test_a_downlink_without_a_map_has_none_and_says_so(tmp_path, typed):
     path, downlink = tmp_path / "list.csv", tmp_path / "other.bin"
     save_catalogue(make_catalogue([0.1], [0.2], [6_000.0], source="one"), path)
     time_report = {"reported_ticks": 1, "rate_exponent": 0}
     downlink.write_bytes(DICTIONARY.pack("time_report", time_report, ticks=0, sequence_count=0))
-    figures = typed(f"catalogue landmarks {downlink} --catalogue {path} --json")
+    figures = typed(f"catalogue landmarks {downlink} --catalogue {path} --json", 1)
     assert (figures["landmarks"], figures["median_horizontal_m"]) == (0, None)
 
 

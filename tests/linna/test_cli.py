@@ -8,7 +8,7 @@ import sys
 from pathlib import Path
 from types import SimpleNamespace
 
-import pytest
+from pytest import fixture, mark, raises
 
 from ground_service.ground import open_ground
 from ground_service.passes.archive_import import import_archive
@@ -56,8 +56,7 @@ def test_an_unknown_command_is_one_line_with_the_nearest_name(capsys):
 
 def test_every_command_has_a_description_and_an_example_and_states_required_options():
     for group in cli.GROUPS:
-        top = command_parser(cli.GROUPS, group)
-        for name, parser in all_commands(top):
+        for name, parser in all_commands(command_parser(cli.GROUPS, group)):
             if name.split()[1] != group:
                 continue
             assert parser.description, name
@@ -73,7 +72,7 @@ def test_every_command_has_a_description_and_an_example_and_states_required_opti
                     assert (action.help or "").endswith(REQUIRED), f"{name} {action.option_strings[0]}"
 
 
-@pytest.mark.parametrize(
+@mark.parametrize(
     "words, page",
     [
         (("emulate", "no-such-scenario"), "tutorials/own-scenario"),
@@ -138,7 +137,7 @@ def test_a_number_outside_its_limits_is_refused():
         (ABOVE_ZERO, "nan"),
         (ABOVE_ZERO, "inf"),
     ]:
-        with pytest.raises(argparse.ArgumentTypeError, match=f"expected a number .*found '{text}'"):
+        with raises(argparse.ArgumentTypeError, match=f"expected a number .*found '{text}'"):
             wrong(text)
 
 
@@ -178,12 +177,12 @@ def test_a_list_of_this_machine_imports_neither_http_nor_kernels(tmp_path):
 NS = 1_000_000_000
 
 
-@pytest.fixture(scope="module")
+@fixture(scope="module")
 def reference(tmp_path_factory):
     return save_circle(tmp_path_factory.mktemp("oem") / "reference.oem")
 
 
-@pytest.fixture
+@fixture
 def downlink(tmp_path):
     ticks = int(ticks_from_utc_ns(START + 60 * NS))
     path = tmp_path / "downlink.cadu"
@@ -191,7 +190,7 @@ def downlink(tmp_path):
     return path
 
 
-@pytest.fixture
+@fixture
 def server(tmp_path):
     """A served service with one operator: the options that name it."""
     with served(Settings(home=tmp_path / "served")) as (url, token):
@@ -210,7 +209,7 @@ def test_a_pass_archive_is_imported_and_reported_over_the_wire(typed, server, sy
     assert made["packets"] == here["packets"]
 
 
-@pytest.fixture
+@fixture
 def synthetic_archive(tmp_path, downlink, reference):
     """The smallest pass archive there is."""
     folder = tmp_path / "archive"
@@ -229,8 +228,7 @@ def test_a_wrong_token_and_a_wrong_server_are_reported_in_one_line(typed, server
     assert wrong.strip() == "linna: error: token: expected one that 'linna user add' gave out, found another"
     gone = typed("pass list --server http://127.0.0.1:1 --json", 2)
     assert gone.startswith("linna: error: http://127.0.0.1:1: cannot be reached")
-    odd = typed("pass list --server ftp://x --json", 2)
-    assert "expected a URL such as" in odd
+    assert "expected a URL such as" in typed("pass list --server ftp://x --json", 2)
 
 
 def test_a_failed_job_is_reported_in_one_line_that_names_the_file(tmp_path):

@@ -5,7 +5,8 @@ import json
 from pathlib import Path
 
 import numpy as np
-import pytest
+from numpy.random import default_rng
+from pytest import fixture, mark
 
 import linna
 from linna.cli import run
@@ -13,11 +14,10 @@ from tests.payload_emulator.bowls import BOWL_CENTRES, bowl_image
 
 
 def speckled(shape=(512, 512), dtype=np.uint8):
-    rng = np.random.default_rng(2)
-    return (rng.integers(30, 220, shape) * (np.iinfo(dtype).max // 255)).astype(dtype)
+    return (default_rng(2).integers(30, 220, shape) * (np.iinfo(dtype).max // 255)).astype(dtype)
 
 
-@pytest.fixture
+@fixture
 def write_image(tmp_path):
     import cv2
 
@@ -39,8 +39,8 @@ def test_info_tells_the_hash_and_the_thresholds(typed):
         assert hashlib.sha256(octets).hexdigest() == network["sha256"] and "altitudes" in network["purpose"]
 
 
-@pytest.mark.parametrize(
-    ("name", "image"),
+@mark.parametrize(
+    "name, image",
     [
         ("a.png", speckled()), ("b.tiff", speckled(dtype=np.uint16)), ("c.png", speckled((300, 700, 3))),
         ("d.png", speckled((64, 48))),
@@ -90,7 +90,7 @@ def test_detect_finds_the_sun_that_is_not_given_and_says_so_in_one_line(write_im
 
 
 def test_a_picture_without_craters_leaves_the_sun_unknown(write_image, capsys):
-    noise = np.random.default_rng(3).integers(90, 110, (300, 400)).astype(np.uint8)
+    noise = default_rng(3).integers(90, 110, (300, 400)).astype(np.uint8)
     assert run(["detector", "detect", str(write_image("a.png", noise)), "--json"]) == 0
     out, err = capsys.readouterr()
     assert json.loads(out)["images"][0]["sun"]["source"] == "unknown"
@@ -124,7 +124,7 @@ UNFIT = """
 """
 
 
-@pytest.mark.parametrize(("extra", "words"), [line.split(" -> ") for line in UNFIT.splitlines()[1:]])
+@mark.parametrize("extra, words", [line.split(" -> ") for line in UNFIT.splitlines()[1:]])
 def test_what_does_not_fit_a_labelled_set_is_refused(tmp_path, typed, extra, words):
     assert words in typed(f"detector evaluate --coco {tmp_path} {extra}", 2)
 
@@ -135,8 +135,8 @@ def test_options_of_labelled_sets_are_refused_with_data_sets(tmp_path, typed):
     )
 
 
-@pytest.mark.parametrize(
-    ("extra", "words"),
+@mark.parametrize(
+    "extra, words",
     [
         ("--altitude-km -3", "--altitude-km: expected a number above 0, found '-3'"),
         ("--fov-deg 180", "--fov-deg: expected a number above 0 and below 180, found '180'"),
@@ -165,7 +165,7 @@ def test_what_is_no_model_is_refused_in_one_line(write_image, tmp_path, typed):
     assert "none.onnx" in typed(f"detector info --model {tmp_path}/none.onnx", 2)
 
 
-@pytest.mark.parametrize(
+@mark.parametrize(
     "command",
     ["dataset stats", "dataset check", "detector evaluate --dataset", "detector calibrate --out m.onnx --dataset"],
 )

@@ -4,7 +4,7 @@ import sys
 from threading import Event
 from unittest.mock import MagicMock
 
-import pytest
+from pytest import mark, raises
 
 from ground_service.client import Client
 from ground_service.errors import GroundError
@@ -33,18 +33,18 @@ def test_a_part_that_ends_is_named_after_the_documents_were_posted(tmp_path, mon
     monkeypatch.setattr(living, "Client", lambda _: client)
     monkeypatch.setattr(living, "LOOK_S", 0.01)
     demo = (load_scenario("live-demo"), data_folder(), folder, 60.0, 8042, said.append, Event())
-    with pytest.raises(GroundError, match="spacecraft: expected it to run, found its end; see "):
+    with raises(GroundError, match="spacecraft: expected it to run, found its end; see "):
         living.living_demo(*demo)
     posted = [name for name, _, _ in client.method_calls]
     assert posted == ["add_catalogue", "add_mission", "add_ephemeris", "add_request"]
     client.add_request.assert_called_once_with({"windows": 12})
     assert said.pop() == "http://127.0.0.1:8042/ shows the shift at 60 times real time; Ctrl-C ends"
     client.reset_mock()
-    with pytest.raises(GroundError, match="spacecraft: expected it to run, found its end; see "):
+    with raises(GroundError, match="spacecraft: expected it to run, found its end; see "):
         living.living_demo(*demo)  # goes on: nothing is posted again
     assert client.method_calls == [] and said[-3].startswith("going on from the state of the spacecraft")
     other = (load_scenario("live-pictures"), *demo[1:])
-    with pytest.raises(ScenarioError, match="that of a living demo of this scenario, found one with other files"):
+    with raises(ScenarioError, match="that of a living demo of this scenario, found one with other files"):
         living.living_demo(*other)
 
 
@@ -54,7 +54,7 @@ def test_a_spacecraft_that_goes_on_has_its_state_and_ports_and_the_terrain_of_th
     assert load_scenario("live-demo").terrain == load_scenario("selenita").terrain
 
 
-@pytest.mark.campaign
+@mark.campaign
 def test_a_living_demo_plans_and_commands_until_it_is_ended(tmp_path):
     port, log = free_port(), tmp_path / "log"
     words = ["demo", "--live", "--out", tmp_path / "demo", "--port", port, "--rate", 240]

@@ -5,6 +5,7 @@ import importlib.util
 import json
 
 import pytest
+from pytest import fixture
 
 from linna.cli import run
 from lunar.datafolder import find_data
@@ -16,7 +17,7 @@ SMALL = Effort(
 )
 
 
-@pytest.fixture(scope="module")
+@fixture(scope="module")
 def document(tmp_path_factory):
     out = tmp_path_factory.mktemp("paper") / "paper"
     lines = []

@@ -1,7 +1,7 @@
 """`linna render`: a frame, sheets, renderers side by side, and what it refuses."""
 
 import numpy as np
-import pytest
+from pytest import fixture, mark
 
 from lunar.constants import GM_MOON_M3_S2
 from tests.lazy import Lazy
@@ -23,7 +23,7 @@ height_px = 96
 EPOCHS = ("2029-08-07T00:10:00Z", "2029-08-07T00:20:00Z")
 
 
-@pytest.fixture
+@fixture
 def scenario(tmp_path, monkeypatch):
     monkeypatch.delenv("LINNA_DATA", raising=False)
     monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path))
@@ -79,8 +79,8 @@ def test_cycles_without_blender_is_one_line(scenario, tmp_path, typed, monkeypat
     assert not out.exists()
 
 
-@pytest.mark.parametrize(
-    ("words", "message"),
+@mark.parametrize(
+    "words, message",
     [
         (f"x.jpg --epoch {EPOCHS[0]}", "expected a .png file, found x.jpg"),
         (f"nowhere/x.png --epoch {EPOCHS[0]}", "expected an existing folder"),

@@ -5,7 +5,7 @@ import json
 import struct
 
 import numpy as np
-import pytest
+from pytest import fixture, mark
 
 from linna.cli import run
 from tmtc.dictionary.payload import DICTIONARY
@@ -30,7 +30,7 @@ def make_packets(count):
 PACKETS = make_packets(100)
 
 
-@pytest.fixture
+@fixture
 def downlink(tmp_path):
     path = tmp_path / "downlink.cadu"
     path.write_bytes(encode_cadus(PACKETS, spacecraft_id=76))
@@ -94,7 +94,7 @@ def test_only_the_wanted_packets_are_decoded(downlink, typed):
     assert "found 'nonsense'" in typed(f"tm decode {downlink} --packet nonsense", 2)
 
 
-@pytest.mark.parametrize("content", [b"", b"this is no telemetry at all, not even nearly"])
+@mark.parametrize("content", [b"", b"this is no telemetry at all, not even nearly"])
 def test_a_file_without_telemetry_is_refused_in_one_line(tmp_path, typed, content):
     path = tmp_path / "file.bin"
     path.write_bytes(content)
@@ -134,7 +134,7 @@ def test_the_icd_and_the_xtce_are_written(tmp_path, typed):
 # packets of other missions
 
 
-@pytest.fixture
+@fixture
 def foreign(tmp_path):
     """A capture of another mission without error control, its definition and its packets."""
     from tests.tmtc import foreign
@@ -193,8 +193,8 @@ def test_packets_of_another_mission_are_decoded_through_their_definition(foreign
     assert out.read_bytes()[:4] == b"PAR1"
 
 
-@pytest.mark.parametrize(
-    ("change", "options", "words"),
+@mark.parametrize(
+    "change, options, words",
     [
         (('sizeInBits="64"', 'sizeInBits="640"'), "", "sizeInBits of 1 to 64, found 640"),
         (("</SpaceSystem>", ""), "", "well-formed XML"),
@@ -240,7 +240,7 @@ def bus_packet(count, data, *, secondary=True, flags=3, apid=200):
     return struct.pack(">HHH", first, flags << 14 | count, len(data) - 1) + data
 
 
-@pytest.fixture
+@fixture
 def timed(tmp_path, typed):
     """A definition whose packets have a time of four octets, and a function that checks or decodes packets with it."""
     from tests.tmtc.foreign import HEADER_CONTAINER, HEADER_PARAMETERS, HEADER_TYPES, comparison, container, document
@@ -289,8 +289,7 @@ def test_the_configuration_of_yamcs_is_written_for_a_spacecraft_and_a_station(tm
     command = f"tm yamcs --out {tmp_path}/y --spacecraft-id 77 --station host"
     files = typed(f"{command}:1234 --json")["files"]
     assert sorted(files) == sorted(str(path) for path in (tmp_path / "y").rglob("*.*"))
-    instance = YAML(typ="safe").load((tmp_path / "y/etc/yamcs.linna.yaml").read_text())
-    frames, telecommands = instance["dataLinks"]
+    frames, telecommands = YAML(typ="safe").load((tmp_path / "y/etc/yamcs.linna.yaml").read_text())["dataLinks"]
     assert (frames["spacecraftId"], frames["frameLength"], frames["errorDetection"]) == (77, 1115, "CRC16")
     assert [one["vcId"] for one in frames["virtualChannels"]] == [0, 1]
     assert (telecommands["host"], telecommands["port"]) == ("host", 1234)

@@ -226,6 +226,8 @@ def test_craters_that_are_listed_twice_with_two_ids_count_once_and_are_reported(
     path = tmp_path / "own.csv"
     path.write_text(OWN.replace("\n1,-36", "\n3,-36"))
     assert load_catalogue(path).ids.tolist() == [1, 3]
+    path.rename(tmp_path / "lu1319381_ge2km.csv")
+    load_catalogue(tmp_path / "lu1319381_ge2km.csv")
     assert caplog.messages == [f"{path}: left out 1 of 3 craters, equal to one before but for the id"]
 
 

@@ -2,14 +2,17 @@
 
 import json
 import math
+from math import cos, pi, radians, sin
 from pathlib import Path
 
 import erfa
 import numpy as np
-import pytest
 import spiceypy
 from hypothesis import given
 from hypothesis import strategies as st
+from numpy import allclose, count_nonzero, exp, eye
+from numpy.linalg import norm
+from pytest import approx, fixture, mark, raises
 
 from lunar.constants import ASTRONOMICAL_UNIT_M, EARTH_RADIUS_M, MOON_RADIUS_M, NS, SPEED_OF_LIGHT_M_S, SUN_RADIUS_M
 from lunar.datafolder import DataFolder, default_orientation, find_data
@@ -53,7 +56,7 @@ SPICE_EPOCHS_TDB_S = np.array(SPICE["epochs_tdb_s"])
 # The same model in the same arithmetic: 1e-9 rad is 1.7 mm on the ground.
 SAME_MODEL_RAD = 1e-9
 
-unit_quaternions = st.lists(st.floats(-1.0, 1.0), min_size=4, max_size=4).filter(lambda q: np.linalg.norm(q) > 0.1)
+unit_quaternions = st.lists(st.floats(-1.0, 1.0), min_size=4, max_size=4).filter(lambda q: norm(q) > 0.1)
 latitudes = st.floats(-np.pi / 2, np.pi / 2)
 longitudes = st.floats(-2 * np.pi, 2 * np.pi)
 
@@ -62,16 +65,15 @@ def angle_rad(first, second):
     """Angle of the rotation between matrices (..., 3, 3)."""
     difference = first @ np.swapaxes(second, -1, -2)
     off = difference - np.swapaxes(difference, -1, -2)
-    sine = np.linalg.norm(np.stack([off[..., 2, 1], off[..., 0, 2], off[..., 1, 0]]), axis=0) / 2
-    return np.arcsin(np.clip(sine, 0, 1))
+    return np.arcsin(np.clip(norm(np.stack([off[..., 2, 1], off[..., 0, 2], off[..., 1, 0]]), axis=0) / 2, 0, 1))
 
 
-@pytest.fixture(scope="module")
+@fixture(scope="module")
 def de421(data_path):
     return load_orientation(data_path / "kernels/moon_pa_de421_1900-2050.bpc", data_path / "kernels/moon_080317.tf")
 
 
-@pytest.fixture(scope="module")
+@fixture(scope="module")
 def spice_kernels(data_path):
     names = ("pck00010.tpc", "moon_pa_de421_1900-2050.bpc", "moon_080317.tf")
     for name in names:
@@ -89,8 +91,8 @@ def test_the_iau_series_is_that_of_spice_at_stored_epochs():
     assert np.max(angle_rad(ours, np.array(SPICE["rotations"]["IAU_MOON"]))) < SAME_MODEL_RAD
 
 
-@pytest.mark.real_data
-@pytest.mark.parametrize("frame", ["IAU_MOON", "MOON_PA", "MOON_ME"])
+@mark.real_data
+@mark.parametrize("frame", ["IAU_MOON", "MOON_PA", "MOON_ME"])
 def test_rotations_are_those_of_spice_with_the_same_kernels(frame, de421, spice_kernels):
     # From 1905 to 2049, both sides of every record edge that falls in between.
     epochs = np.r_[np.linspace(-3.0e9, 1.55e9, 301), de421.start_tdb_s + de421.record_s * np.arange(5000, 5010)]
@@ -102,9 +104,9 @@ def test_rotations_are_those_of_spice_with_the_same_kernels(frame, de421, spice_
     assert np.max(angle_rad(ours, spice_rotations(frame, epochs))) < SAME_MODEL_RAD
 
 
-@pytest.mark.real_data
+@mark.real_data
 def test_the_kernel_file_gives_the_constant_rotation_that_is_built_in(de421):
-    assert np.max(np.abs(de421.me_from_pa @ PA_FROM_ME_DE421 - np.eye(3))) < 1e-15
+    assert np.max(np.abs(de421.me_from_pa @ PA_FROM_ME_DE421 - eye(3))) < 1e-15
 
 
 def test_the_rotation_from_principal_to_mean_earth_axes_is_that_of_naif_and_of_900_m_on_the_ground():
@@ -116,11 +118,10 @@ def test_the_rotation_from_principal_to_mean_earth_axes_is_that_of_naif_and_of_9
     assert np.all(apart.max(axis=1) < (1e-3, 1e-9))
     # Williams, Boggs, Folkner 2008: 860 m at most on the surface ("about 0.9 km").
     place = mcmf_from_spherical(*np.meshgrid(np.linspace(-1.5, 1.5, 61), np.linspace(0, 6.2, 63)))
-    offset_m = np.linalg.norm(place @ PA_FROM_ME_DE421.T - place, axis=-1)
-    assert 850.0 < offset_m.max() < 900.0
+    assert 850.0 < norm(place @ PA_FROM_ME_DE421.T - place, axis=-1).max() < 900.0
 
 
-@pytest.mark.real_data
+@mark.real_data
 def test_the_iau_series_is_within_two_hundred_metres_of_de421_in_this_century(de421):
     epochs = np.linspace(0.0, 1.55e9, 500)
     apart_m = MOON_RADIUS_M * angle_rad(IauOrientation().mcmf_from_icrf(epochs), de421.mcmf_from_icrf(epochs))
@@ -132,7 +133,7 @@ def test_mci_has_the_iau_pole_and_its_node_on_the_equator_and_the_bias_of_j2000_
     tdb_s = 934_027_269.183
     mci = mci_from_icrf(tdb_s)
     assert mci.shape == (3, 3)
-    assert np.allclose(mci[2], IauOrientation().mcmf_from_icrf(tdb_s)[2], atol=1e-15)
+    assert allclose(mci[2], IauOrientation().mcmf_from_icrf(tdb_s)[2], atol=1e-15)
     assert abs(mci[0, 2]) < 1e-15  # x lies in the equator of ICRF
     assert np.cross([0, 0, 1.0], mci[2]) @ mci[0] > 0.0  # and is the ascending node
     bias, _, _ = erfa.bp06(2_451_545.0, 0.0)
@@ -148,8 +149,7 @@ def test_enu_is_that_of_pymap3d_on_a_sphere(latitude, longitude):
     place = mcmf_from_spherical(latitude, longitude)
     beyond = place + np.array([300.0, -200.0, 500.0])
     theirs = pymap3d.ecef2enu(*beyond, latitude, longitude, 0.0, ell=ball, deg=False)
-    ours = enu_from_mcmf(latitude, longitude) @ (beyond - place)
-    assert np.allclose(ours, np.array(theirs, dtype=float), atol=1e-6)
+    assert allclose(enu_from_mcmf(latitude, longitude) @ (beyond - place), np.array(theirs, dtype=float), atol=1e-6)
 
 
 @given(latitudes, longitudes, st.floats(-1000.0, 100_000.0))
@@ -157,33 +157,33 @@ def test_spherical_coordinates_survive_cartesian_and_back(latitude, longitude, a
     back = spherical_from_mcmf(mcmf_from_spherical(latitude, longitude, altitude_m))
     assert abs(back[0] - latitude) < 1e-12
     if abs(latitude) < np.pi / 2 - 1e-6:
-        assert abs(np.exp(1j * back[1]) - np.exp(1j * longitude)) < 1e-9
+        assert abs(exp(1j * back[1]) - exp(1j * longitude)) < 1e-9
     assert abs(back[2] - altitude_m) < 1e-8
 
 
 def test_rtn_of_a_circular_equatorial_orbit_points_out_along_and_north():
     rtn = rtn_from_inertial([[1.0, 0, 0], [0, 2.0, 0]], [[0, 1.0, 0], [-1.0, 0, 0]])
-    assert np.allclose(rtn[0], np.eye(3))
-    assert np.allclose(rtn[1], [[0, 1, 0], [-1, 0, 0], [0, 0, 1]])
+    assert allclose(rtn[0], eye(3))
+    assert allclose(rtn[1], [[0, 1, 0], [-1, 0, 0], [0, 0, 1]])
 
 
 @given(unit_quaternions)
 def test_quaternions_are_those_of_spice_and_survive_the_matrix(values):
-    q = np.array(values) / np.linalg.norm(values)
+    q = np.array(values) / norm(values)
     matrix = matrix_from_quaternion(q)
     # SPICE q2m: v_out = q v q*, scalar first, as here.
-    assert np.allclose(matrix, spiceypy.q2m(q), atol=1e-14)
+    assert allclose(matrix, spiceypy.q2m(q), atol=1e-14)
     back = quaternion_from_matrix(matrix)
     assert back[0] >= 0.0
     assert min(np.abs(back - q).max(), np.abs(back + q).max()) < 1e-12
 
 
 def test_half_turns_have_quaternions_too():
-    for q in np.eye(4)[1:]:
-        assert np.allclose(np.abs(quaternion_from_matrix(matrix_from_quaternion(q))), q)
+    for q in eye(4)[1:]:
+        assert allclose(np.abs(quaternion_from_matrix(matrix_from_quaternion(q))), q)
 
 
-@pytest.mark.parametrize("shape", [(), (0,), (1,), (2, 3)])
+@mark.parametrize("shape", [(), (0,), (1,), (2, 3)])
 def test_rotations_keep_leading_dimensions_and_are_orthonormal(shape):
     epochs = np.full(shape, 9.0e8) + np.arange(np.prod(shape, dtype=int)).reshape(shape) * 1e5
     places = np.broadcast_to(np.array([1.0, 2.0, 3.0]), (*shape, 3))
@@ -195,24 +195,24 @@ def test_rotations_keep_leading_dimensions_and_are_orthonormal(shape):
     ]
     for rotation in rotations:
         assert rotation.shape == (*shape, 3, 3)
-        assert np.allclose(rotation @ np.swapaxes(rotation, -1, -2), np.eye(3), atol=1e-14)
-        assert np.allclose(np.linalg.det(rotation), 1.0)
+        assert allclose(rotation @ np.swapaxes(rotation, -1, -2), eye(3), atol=1e-14)
+        assert allclose(np.linalg.det(rotation), 1.0)
     assert quaternion_from_matrix(rotations[0]).shape == (*shape, 4)
 
 
-@pytest.mark.real_data
+@mark.real_data
 def test_epochs_outside_the_kernel_are_refused(de421):
-    with pytest.raises(EphemerisCoverageError, match=r"DE421: expected an epoch within"):
+    with raises(EphemerisCoverageError, match=r"DE421: expected an epoch within"):
         de421.mcmf_from_icrf([0.0, 2.0e9])
 
 
-@pytest.mark.real_data
-@pytest.mark.parametrize("kept", [0, 500, 3000, 1_000_000])
+@mark.real_data
+@mark.parametrize("kept", [0, 500, 3000, 1_000_000])
 def test_a_kernel_cut_short_is_refused_with_its_name(data_path, tmp_path, kept):
     octets = (data_path / "kernels/moon_pa_de421_1900-2050.bpc").read_bytes()
     path = tmp_path / "cut.bpc"
     path.write_bytes(octets[:kept])
-    with pytest.raises(DataFileError, match=r"cut\.bpc.*expected.*found"):
+    with raises(DataFileError, match=r"cut\.bpc.*expected.*found"):
         load_orientation(path)
 
 
@@ -220,19 +220,19 @@ def test_a_file_of_another_kind_and_a_missing_one_are_refused(tmp_path):
     other = tmp_path / "other.bpc"
     other.write_bytes(b"DAF/SPK " + bytes(5000))
     for path in (other, tmp_path / "none.bpc"):
-        with pytest.raises(DataFileError, match="expected a binary PCK kernel"):
+        with raises(DataFileError, match="expected a binary PCK kernel"):
             load_orientation(path)
 
 
-@pytest.mark.real_data
+@mark.real_data
 def test_a_frame_kernel_without_the_mean_earth_frame_is_refused(data_path, tmp_path):
     path = tmp_path / "wrong.tf"
     path.write_text("KPL/FK\n\\begindata\nFRAME_31006_NAME = 'MOON_PA_DE421'\n\\begintext\n")
-    with pytest.raises(DataFileError, match="three angles of a mean-Earth frame"):
+    with raises(DataFileError, match="three angles of a mean-Earth frame"):
         load_orientation(data_path / "kernels/moon_pa_de421_1900-2050.bpc", path)
 
 
-@pytest.mark.parametrize("count", [0, 1, 40])
+@mark.parametrize("count", [0, 1, 40])
 def test_signs_of_successive_quaternions_do_not_flip(count):
     angle = 0.3 * np.arange(count)
     smooth = np.stack([np.cos(angle), np.sin(angle), 0.0 * angle, 0.0 * angle], axis=1)
@@ -240,7 +240,7 @@ def test_signs_of_successive_quaternions_do_not_flip(count):
     np.testing.assert_array_equal(continuous_quaternions(flipped), smooth)
 
 
-@pytest.fixture(scope="module")
+@fixture(scope="module")
 def day():
     """A circular polar orbit of the paper's semi-major axis, one day in 15 s steps."""
     return polar_orbit(23.999, 15.0)
@@ -248,10 +248,9 @@ def day():
 
 def test_a_pass_within_sixty_degrees_lasts_37_minutes_and_epochs_can_be_chosen(day):
     track = ground_track(day, IauOrientation())
-    inside = np.abs(track.latitude_rad) <= math.radians(60)
+    inside = np.abs(track.latitude_rad) <= radians(60)
     edges = np.flatnonzero(np.diff(inside.astype(int)))
-    lengths = np.diff(edges)[int(inside[edges[0]]) :: 2] * 15.0 / 60.0
-    assert np.mean(lengths) == pytest.approx(111.20 / 3, abs=0.1)
+    assert np.mean(np.diff(edges)[int(inside[edges[0]]) :: 2] * 15.0 / 60.0) == approx(111.20 / 3, abs=0.1)
     epochs = even_epochs(day, 60.0)
     assert np.all(np.diff(epochs) == 60 * NS)
     track = ground_track(day, IauOrientation(), epochs)
@@ -270,11 +269,11 @@ def test_an_empty_folder_holds_nothing_and_what_is_no_folder_is_refused(tmp_path
     assert (data.root, data.names()) == (tmp_path, ())
     (tmp_path / "file").write_text("")
     for name in ("absent", "file"):
-        with pytest.raises(DataFileError, match="expected a data folder"):
+        with raises(DataFileError, match="expected a data folder"):
             find_data(tmp_path / name)
 
 
-@pytest.mark.real_data
+@mark.real_data
 def test_the_whole_data_folder_is_recognised(data_path):
     data = find_data(data_path)
     missing = [name for name in DataFolder.__slots__ if not getattr(data, name)]
@@ -303,18 +302,17 @@ LANDINGS = """
 """
 
 
-@pytest.mark.parametrize("landing", LANDINGS.strip().splitlines())
+@mark.parametrize("landing", LANDINGS.strip().splitlines())
 def test_the_sun_stood_where_the_apollo_crews_found_it(landing):
     landing_utc, *numbers = landing.split()
     latitude_deg, longitude_deg, sun_angle_deg = map(float, numbers)
     tdb_s = tdb_s_from_utc_ns(parse_utc(landing_utc))
     sun_mcmf_m = IauOrientation().mcmf_from_icrf(tdb_s) @ sun_position_icrf_m(tdb_s)
-    place = np.radians([latitude_deg, longitude_deg])
-    elevation, azimuth = np.degrees(sun_elevation_azimuth(*place, sun_mcmf_m))
+    elevation, azimuth = np.degrees(sun_elevation_azimuth(*np.radians([latitude_deg, longitude_deg]), sun_mcmf_m))
     # Sun angles are published to 0.1 deg and were rounded from mission plans: the Sun climbs 0.1 deg in 12 minutes.
-    assert elevation == pytest.approx(sun_angle_deg, abs=0.2)
+    assert elevation == approx(sun_angle_deg, abs=0.2)
     # They landed in the morning, with the Sun in the east behind them.
-    assert azimuth == pytest.approx(90.0, abs=8.0)
+    assert azimuth == approx(90.0, abs=8.0)
 
 
 def test_the_earth_shadowed_the_moon_when_the_eclipse_catalogue_says():
@@ -323,7 +321,7 @@ def test_the_earth_shadowed_the_moon_when_the_eclipse_catalogue_says():
     utc_ns = np.array([parse_utc(f"2018-07-27T{clock}") for clock in ("17:00:00", "20:21:44", "23:45:00")])
     tdb_s = tdb_s_from_utc_ns(utc_ns)
     earth, sun = earth_position_icrf_m(tdb_s), sun_position_icrf_m(tdb_s)
-    position = 1_797_400.0 * earth / np.linalg.norm(earth, axis=1, keepdims=True)
+    position = 1_797_400.0 * earth / norm(earth, axis=1, keepdims=True)
     assert sunlit_fraction(position, sun, earth).tolist() == [1.0, 0.0, 1.0]
     assert sunlit_fraction(position, sun).tolist() == [1.0] * 3
 
@@ -334,41 +332,40 @@ def test_the_sun_sets_on_a_spacecraft_within_a_penumbra_of_the_suns_width():
     # Angle from the anti-Sun direction at which the Sun's centre touches the limb; its disc is 9.3 mrad wide.
     edge = math.asin(MOON_RADIUS_M / radius)
     half = SUN_RADIUS_M / ASTRONOMICAL_UNIT_M
-    angle = np.array([0.0, edge - 2 * half, edge, edge + 2 * half, math.pi])
-    position = radius * np.stack([-np.cos(angle), np.sin(angle), np.zeros(5)], -1)
-    fraction = sunlit_fraction(position, sun)
+    angle = np.array([0.0, edge - 2 * half, edge, edge + 2 * half, pi])
+    fraction = sunlit_fraction(radius * np.stack([-np.cos(angle), np.sin(angle), np.zeros(5)], -1), sun)
     assert fraction[[0, 1, 3, 4]].tolist() == [0.0, 0.0, 1.0, 1.0]
     # The limb is so large that it halves the disc like a straight edge; its curvature gives a third of a percent.
-    assert fraction[2] == pytest.approx(0.5, abs=0.005)
+    assert fraction[2] == approx(0.5, abs=0.005)
 
 
 @given(st.floats(0.0, 0.02), st.floats(0.0, 0.01), st.floats(0.001, 0.01))
 def test_the_covered_share_of_a_disc_is_that_of_a_fine_grid(apart, near_radius, far_radius):
     # Far body at unit distance 10, near body at 1, so angular radii are asin(R / d).
     to_far = np.array([10.0, 0.0, 0.0])
-    to_near = np.array([math.cos(apart), math.sin(apart), 0.0])
+    to_near = np.array([cos(apart), sin(apart), 0.0])
     from lunar.visibility import _disc_overlap
 
-    share = _disc_overlap(to_far, 10.0 * math.sin(far_radius), to_near, math.sin(near_radius))
+    share = _disc_overlap(to_far, 10.0 * sin(far_radius), to_near, sin(near_radius))
     x, y = np.meshgrid(*[np.linspace(-far_radius, far_radius, 400)] * 2)
     disc = x**2 + y**2 <= far_radius**2
     covered = (x - apart) ** 2 + y**2 <= near_radius**2
     # 126,000 grid points inside the disc; its edge blurs a percent of them.
-    assert share == pytest.approx(np.count_nonzero(disc & covered) / np.count_nonzero(disc), abs=0.01)
+    assert share == approx(count_nonzero(disc & covered) / count_nonzero(disc), abs=0.01)
 
 
 def test_azimuth_runs_clockwise_from_north_and_the_subsatellite_point_undoes_the_orientation():
     place = mcmf_from_spherical(0.3, 0.5)
     east, north, up = enu_from_mcmf(0.3, 0.5)
     for azimuth in (0.0, 0.5, 2.0, 4.0, 6.0):
-        sun = place + 1e11 * (math.sin(azimuth) * east + math.cos(azimuth) * north + math.tan(0.2) * up)
-        assert sun_elevation_azimuth(0.3, 0.5, sun) == pytest.approx((0.2, azimuth), abs=1e-9)
+        sun = place + 1e11 * (sin(azimuth) * east + cos(azimuth) * north + math.tan(0.2) * up)
+        assert sun_elevation_azimuth(0.3, 0.5, sun) == approx((0.2, azimuth), abs=1e-9)
     tdb_s = tdb_s_from_utc_ns(START + np.arange(3) * 3600 * NS)
     rotation = IauOrientation().mcmf_from_icrf(tdb_s)
     position = np.einsum("nji,nj->ni", rotation, mcmf_from_spherical([0.1, -0.2, 0.3], [1.0, 2.0, -3.0], 20e3))
     latitude, longitude, altitude = subsatellite(position, tdb_s, IauOrientation())
-    assert [*latitude, *longitude] == pytest.approx([0.1, -0.2, 0.3, 1.0, 2.0, -3.0])
-    assert altitude == pytest.approx(20e3, abs=1e-6)
+    assert [*latitude, *longitude] == approx([0.1, -0.2, 0.3, 1.0, 2.0, -3.0])
+    assert altitude == approx(20e3, abs=1e-6)
 
 
 def test_the_limb_hides_the_earth_on_the_far_side_only():
@@ -378,12 +375,11 @@ def test_the_limb_hides_the_earth_on_the_far_side_only():
     # the parallax of the Earth, 0.26 deg).
     dip = math.acos(MOON_RADIUS_M / radius)
     parallax = MOON_RADIUS_M / 384_400e3
-    limit = math.pi / 2 + dip - parallax
-    for angle, seen in ((0.0, True), (1.5, True), (limit - 1e-3, True), (limit + 1e-3, False), (math.pi, False)):
-        position = radius * np.array([math.cos(angle), math.sin(angle), 0.0])
-        assert bool(limb_clearance_m(position, earth) > 0.0) is seen
+    limit = pi / 2 + dip - parallax
+    for angle, seen in ((0.0, True), (1.5, True), (limit - 1e-3, True), (limit + 1e-3, False), (pi, False)):
+        assert bool(limb_clearance_m(radius * np.array([cos(angle), sin(angle), 0.0]), earth) > 0.0) is seen
     assert limb_clearance_m([0.0, radius, 0.0], [384_400e3, radius, 0.0]) == np.inf
-    assert limb_clearance_m([-1.0, radius, 0.0], [384_400e3, radius, 0.0]) == pytest.approx(30e3)
+    assert limb_clearance_m([-1.0, radius, 0.0], [384_400e3, radius, 0.0]) == approx(30e3)
 
 
 def orbit(hours=6):
@@ -391,10 +387,10 @@ def orbit(hours=6):
     return ephemeris_from_states(times(elapsed), *circle(elapsed, north=POLAR))
 
 
-GOLDSTONE = GroundStation("DSS-14", math.radians(35.42590), math.radians(243.11046), 1002.0)
+GOLDSTONE = GroundStation("DSS-14", radians(35.42590), radians(243.11046), 1002.0)
 
 
-@pytest.mark.filterwarnings("ignore:.*dubious year:erfa.ErfaWarning")
+@mark.filterwarnings("ignore:.*dubious year:erfa.ErfaWarning")
 def test_station_and_elevation_are_those_of_astropy():
     from astropy import units as u
     from astropy.coordinates import GCRS, ITRS, AltAz, CartesianRepresentation, EarthLocation
@@ -408,7 +404,7 @@ def test_station_and_elevation_are_those_of_astropy():
         time = Time("2024-08-07T18:00:00", scale="utc")
         theirs = place.get_gcrs_posvel(time)[0].xyz.to_value(u.m)
         # UT1 - UTC is 0.02 s and polar motion 0.3 arcseconds then: 10 m each, here left out.
-        assert np.linalg.norm(ours - theirs) < 30.0
+        assert norm(ours - theirs) < 30.0
         moon = np.array([2.0e8, -2.5e8, 2.0e8])
         seen = ITRS(CartesianRepresentation(moon * u.m), obstime=time)
         direction = seen.transform_to(GCRS(obstime=time)).cartesian.xyz.to_value(u.m)
@@ -418,7 +414,7 @@ def test_station_and_elevation_are_those_of_astropy():
     leg = direction - theirs
     up = _zenith(GOLDSTONE) @ _itrf_from_icrf(utc_ns)
     # 1e-4 rad is what the Earth turns in 1.4 s.
-    assert math.asin(leg @ up / np.linalg.norm(leg)) == pytest.approx(elevation, abs=1e-4)
+    assert math.asin(leg @ up / norm(leg)) == approx(elevation, abs=1e-4)
 
 
 def test_range_and_light_time_are_those_of_the_signal_that_arrives():
@@ -426,15 +422,15 @@ def test_range_and_light_time_are_those_of_the_signal_that_arrives():
     received = START + np.arange(10, 300, 7) * 60 * NS
     received = received[received < ephemeris.stop_utc_ns]
     found = link(ephemeris, received, GOLDSTONE)
-    assert np.allclose(found.range_m, found.light_time_s * SPEED_OF_LIGHT_M_S, rtol=0, atol=1e-3)
+    assert allclose(found.range_m, found.light_time_s * SPEED_OF_LIGHT_M_S, rtol=0, atol=1e-3)
     emitted = received - np.rint(found.light_time_s * NS).astype(np.int64)
     position, _ = ephemeris.at(emitted)
     # Geocentric places of the spacecraft at emission and of the station at reception.
     spacecraft = position - earth_position_icrf_m(tdb_s_from_utc_ns(emitted))
-    distance = np.linalg.norm(spacecraft - station_icrf(GOLDSTONE, received)[0], axis=1)
-    assert np.allclose(found.range_m, distance, rtol=0, atol=1e-3)
+    distance = norm(spacecraft - station_icrf(GOLDSTONE, received)[0], axis=1)
+    assert allclose(found.range_m, distance, rtol=0, atol=1e-3)
     assert np.all((found.light_time_s > 1.15) & (found.light_time_s < 1.37))
-    assert np.array_equal(found.visible, (found.limb_clearance_m > 0) & (found.elevation_rad >= math.radians(10)))
+    assert np.array_equal(found.visible, (found.limb_clearance_m > 0) & (found.elevation_rad >= radians(10)))
 
 
 def test_the_spacecraft_is_behind_the_moon_about_half_of_a_revolution_that_faces_the_earth():
@@ -445,7 +441,7 @@ def test_the_spacecraft_is_behind_the_moon_about_half_of_a_revolution_that_faces
     earth = earth_position_icrf_m(tdb_s_from_utc_ns(epochs))
     geometry = limb_clearance_m(ephemeris.at(epochs)[0], earth) > 0.0
     # Light time shifts the edges by 1.3 s, less than a step.
-    assert np.count_nonzero(found.visible != geometry) <= 4
+    assert count_nonzero(found.visible != geometry) <= 4
     assert 0.4 < np.mean(found.visible) < 0.75
     windows = find_windows(lambda t: link(ephemeris, t).visible, int(epochs[0]), int(epochs[-1]), 30.0, 0.01)
     assert 2 <= len(windows) <= 4
@@ -456,11 +452,11 @@ def test_the_spacecraft_is_behind_the_moon_about_half_of_a_revolution_that_faces
 
 
 def test_a_link_before_the_ephemeris_starts_is_refused():
-    with pytest.raises(EphemerisCoverageError):
+    with raises(EphemerisCoverageError):
         link(orbit(), START)
 
 
-@pytest.mark.parametrize("shape", [(), (0,), (1,), (2, 3)])
+@mark.parametrize("shape", [(), (0,), (1,), (2, 3)])
 def test_links_keep_leading_dimensions(shape):
     found = link(orbit(), np.full(shape, START + 3600 * NS), GOLDSTONE)
     assert found.visible.shape == found.range_m.shape == found.elevation_rad.shape == shape
@@ -477,7 +473,7 @@ def test_windows_are_found_to_the_tolerance_and_may_reach_the_ends():
     assert windows.shape == (3, 2) and np.max(np.abs(windows.ravel() - edges)) <= 1000
     assert find_windows(lambda t: t < 0, first, last) == []
     assert find_windows(lambda t: t > 0, first, last) == [(first, last)]
-    with pytest.raises(LunarError, match="expected a stop after the start"):
+    with raises(LunarError, match="expected a stop after the start"):
         find_windows(condition, last, first)
 
 

@@ -6,8 +6,10 @@ import sys
 from pathlib import Path
 
 import numpy as np
-import pytest
 from mpmath import atan2, cos, mp, mpf, sin, sqrt
+from numpy import allclose, array_equal
+from numpy.linalg import norm
+from pytest import approx, mark, raises
 
 from lunar import _gravity_kernel as kernel
 from lunar.errors import DataFileError, OrbitError
@@ -59,20 +61,20 @@ def at(latitude_deg, longitude_deg, altitude_km=30.0):
     return r * np.array([math.cos(lat) * math.cos(lon), math.cos(lat) * math.sin(lon), math.sin(lat)])
 
 
-@pytest.mark.parametrize("place", [at(37.0, -101.0), at(-89.2, 12.0), at(1e-3, 200.0, 14.0)])
+@mark.parametrize("place", [at(37.0, -101.0), at(-89.2, 12.0), at(1e-3, 200.0, 14.0)])
 def test_degree_100_agrees_with_an_evaluation_in_fifty_digits(place):
     field = kaula_field(100)
     expected = exact_acceleration(field, place, 100)
     # 5,000 terms of a double each: a few units in the last place of the sum.
-    assert np.linalg.norm(acceleration(field, place) - expected) <= 5e-15 * np.linalg.norm(expected)
+    assert norm(acceleration(field, place) - expected) <= 5e-15 * norm(expected)
 
 
-@pytest.mark.parametrize("degree", [*range(13), 20, 31, 32, 33])
+@mark.parametrize("degree", [*range(13), 20, 31, 32, 33])
 def test_every_degree_agrees_with_the_definition_whatever_the_number_of_blocks(degree):
     field = kaula_field(33)
     place = at(-21.0, 77.0, 100.0)
     expected = exact_acceleration(field, place, degree)
-    assert np.linalg.norm(acceleration(field, place, degree) - expected) <= 3e-15 * np.linalg.norm(expected)
+    assert norm(acceleration(field, place, degree) - expected) <= 3e-15 * norm(expected)
 
 
 def test_a_sphere_pulls_as_a_point_mass_and_nothing_happens_at_the_poles():
@@ -80,11 +82,11 @@ def test_a_sphere_pulls_as_a_point_mass_and_nothing_happens_at_the_poles():
     pole = np.array([0.0, 0.0, -1.768e6])
     nearby = acceleration(field, pole + np.array([1e-3, 0.0, 0.0]))
     # The gradient is 2e-6 1/s^2: 1 mm away the acceleration differs by 2e-9 m/s^2 and no more.
-    assert np.allclose(acceleration(field, pole), nearby, rtol=0.0, atol=4e-9)
+    assert allclose(acceleration(field, pole), nearby, rtol=0.0, atol=4e-9)
     assert np.all(np.isfinite(gradient(field, pole, 20)))
     place = at(12.0, 34.0, 1000.0)
-    expected = -4.9028e12 * place / np.linalg.norm(place) ** 3
-    assert np.allclose(acceleration(kaula_field(5), place, 0), expected, rtol=1e-15)
+    expected = -4.9028e12 * place / norm(place) ** 3
+    assert allclose(acceleration(kaula_field(5), place, 0), expected, rtol=1e-15)
 
 
 def test_oblateness_pulls_as_in_the_closed_form():
@@ -98,10 +100,10 @@ def test_oblateness_pulls_as_in_the_closed_form():
     k = 5.0 * z * z / r**2
     expected = common * np.array([x * (1 - k), y * (1 - k), z * (3 - k)])
     found = acceleration(GravityField("J2", gm, radius, c, np.zeros((3, 3))), [x, y, z])
-    assert np.allclose(found + gm * np.array([x, y, z]) / r**3, expected, rtol=1e-11, atol=1e-16)
+    assert allclose(found + gm * np.array([x, y, z]) / r**3, expected, rtol=1e-11, atol=1e-16)
 
 
-@pytest.mark.parametrize("degree", [0, 1, 2, 8, 40])
+@mark.parametrize("degree", [0, 1, 2, 8, 40])
 def test_the_gradient_is_the_change_of_the_acceleration(degree):
     field = kaula_field(40)
     place, step = at(-63.0, 140.0), 10.0
@@ -114,8 +116,8 @@ def test_the_gradient_is_the_change_of_the_acceleration(degree):
     )
     found = gradient(field, place, degree)
     # Differences over 20 m: curvature of the field to degree 40 leaves 1e-13, rounding 1e-17 (1/s^2).
-    assert np.allclose(found, expected, rtol=0.0, atol=1e-12)
-    assert np.array_equal(found, found.T)
+    assert allclose(found, expected, rtol=0.0, atol=1e-12)
+    assert array_equal(found, found.T)
     assert abs(np.trace(found)) < 1e-20
 
 
@@ -125,7 +127,7 @@ def test_shapes_are_kept_for_none_one_and_many_positions():
     assert acceleration(field, at(0, 0)).shape == (3,)
     places = np.array([[at(0, 0), at(10, 20)], [at(30, 40), at(50, 60)]])
     assert acceleration(field, places).shape == (2, 2, 3)
-    assert np.array_equal(acceleration(field, places)[1, 0], acceleration(field, at(30, 40)))
+    assert array_equal(acceleration(field, places)[1, 0], acceleration(field, at(30, 40)))
     assert gradient(field, places).shape == (2, 2, 3, 3)
 
 
@@ -146,7 +148,7 @@ def test_the_other_vector_width_gives_the_same_sums(tmp_path):
         found = other.accelerations(other.pack(field.c_bar, field.s_bar, field.gm_m3_s2, field.radius_m), places)
     finally:
         del sys.modules["other_width"]
-    assert np.allclose(found, acceleration(field, places), rtol=1e-14)
+    assert allclose(found, acceleration(field, places), rtol=1e-14)
 
 
 def test_truncation_asks_for_a_degree_the_field_has_and_the_built_in_one_says_what_it_is():
@@ -154,7 +156,7 @@ def test_truncation_asks_for_a_degree_the_field_has_and_the_built_in_one_says_wh
     assert field.truncated(3).degree == 3
     assert field.truncated(5) is field
     for degree in (6, -1):
-        with pytest.raises(OrbitError, match=f"expected a degree from 0 to 5, found {degree}"):
+        with raises(OrbitError, match=f"expected a degree from 0 to 5, found {degree}"):
             acceleration(field, at(0, 0), degree)
     assert packed(field, 3) is packed(field, 3)
     field = builtin_gravity()
@@ -163,10 +165,10 @@ def test_truncation_asks_for_a_degree_the_field_has_and_the_built_in_one_says_wh
     # (B - A)/(M R^2) = 4 C22 over (B - A)/C = 227.7317e-6 (Williams et al. 2014, doi 10.1002/2013JE004559) must be the
     # polar moment of inertia C/(M R^2) = 0.3931 +- 0.0002 (Konopliv et al. 1998, Science 281:1476).
     c22 = field.c_bar[2, 2] * math.sqrt(5.0 / 12.0)
-    assert 4.0 * c22 / 227.7317e-6 == pytest.approx(0.3931, abs=0.0002)
+    assert 4.0 * c22 / 227.7317e-6 == approx(0.3931, abs=0.0002)
 
 
-@pytest.mark.real_data
+@mark.real_data
 def test_the_built_in_field_agrees_with_other_fields(data_path):
     builtin = builtin_gravity()
     for name, tolerance in (("GRGM660PRIM_to150.gfc", 1e-8), ("LP165P.cof", 5e-7)):
@@ -176,7 +178,7 @@ def test_the_built_in_field_agrees_with_other_fields(data_path):
         assert np.abs(other.s_bar - builtin.s_bar).max() < tolerance
 
 
-@pytest.mark.real_data
+@mark.real_data
 def test_published_files_are_read_to_their_last_line(data_path):
     grail = load_gravity(data_path / "gravity" / "GRGM660PRIM_to150.gfc")
     assert (grail.name, grail.degree, grail.gm_m3_s2, grail.radius_m) == (
@@ -230,7 +232,7 @@ a field, for tests
 SHTOOLS_KM = "1.738E+03, 4.9E+03, 2.66E-06, 2, 2\n" + SHADR.partition("\n")[2]
 
 
-@pytest.mark.parametrize(
+@mark.parametrize(
     "text", [ICGEM, COF, SHADR, SHTOOLS, SHTOOLS_KM], ids=["icgem", "cof", "shadr", "pyshtools", "pyshtools in km"]
 )
 def test_the_formats_hold_the_same_field(text, tmp_path):
@@ -280,18 +282,18 @@ hello¶ |  |  | an ICGEM, GMAT .cof, PDS SHADR or pyshtools gravity field
 }
 
 
-@pytest.mark.parametrize("text, row", [(text, row) for text in FAULTS for row in FAULTS[text].strip("\n").splitlines()])
+@mark.parametrize("text, row", [(text, row) for text in FAULTS for row in FAULTS[text].strip("\n").splitlines()])
 def test_a_bad_file_is_named_with_the_place_and_what_was_expected(text, row, tmp_path):
     old, new, where, expected = row.replace("¶", "\n").split(" | ")
     assert old in text
     path = tmp_path / "bad.field"
     path.write_text(text.replace(old, new))
-    with pytest.raises(DataFileError) as caught:
+    with raises(DataFileError) as caught:
         load_gravity(path)
     assert where in caught.value.where and expected in caught.value.expected
     assert str(path) in str(caught.value) and "\n" not in str(caught.value)
 
 
 def test_a_missing_file_is_named(tmp_path):
-    with pytest.raises(DataFileError, match=r"nowhere\.gfc: expected a gravity field file"):
+    with raises(DataFileError, match=r"nowhere\.gfc: expected a gravity field file"):
         load_gravity(tmp_path / "nowhere.gfc")

@@ -1,6 +1,7 @@
 """Pictures of bowl-shaped craters, drawn without any renderer."""
 
 import numpy as np
+from numpy import cos, radians, sin
 
 BOWL_CENTRES = [(130.0, 140.0), (300.0, 210.0), (220.0, 380.0), (400.0, 390.0)]
 
@@ -8,8 +9,8 @@ BOWL_CENTRES = [(130.0, 140.0), (300.0, 210.0), (220.0, 380.0), (400.0, 390.0)]
 def bowl_image(centres=BOWL_CENTRES, radius=20.0, sun_azimuth_deg=0.0):
     """Bowls of spherical section under a Sun at an image azimuth (clockwise from the top), Lambert, 15 degrees up."""
     row, column = np.mgrid[0:512, 0:512].astype(float)
-    azimuth, elevation = np.radians(sun_azimuth_deg), np.radians(15.0)
-    sun = np.array([np.sin(azimuth) * np.cos(elevation), -np.cos(azimuth) * np.cos(elevation), np.sin(elevation)])
+    azimuth, elevation = radians(sun_azimuth_deg), radians(15.0)
+    sun = np.array([sin(azimuth) * cos(elevation), -cos(azimuth) * cos(elevation), sin(elevation)])
     height = np.zeros((512, 512))
     for u, v in centres:
         s = np.hypot(column - u, row - v) / radius

@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from pytest import fixture
 
 from lunar.elements import Elements, icrf_state_from_elements
 from lunar.frames import IauOrientation
@@ -17,7 +18,7 @@ EPOCH = parse_utc("2029-08-07T00:00:00Z")
 TRUTH_DEGREE = 60
 
 
-@pytest.fixture(scope="session", autouse=True)
+@fixture(scope="session", autouse=True)
 def drawn_moons():
     """Keep plains and craters of the two newest seeds, which each opened world would draw; what draws is yielded."""
     plains, craters = procedural._plains_map, procedural._draw_catalogue
@@ -37,7 +38,7 @@ def drawn_moons():
         yield plains, craters
 
 
-@pytest.fixture(scope="session")
+@fixture(scope="session")
 def navigation_case():
     """Return a maker of cases; every argument of `NavigationCase` can be replaced."""
     gravity, craters = rough_gravity(TRUTH_DEGREE), crater_world()

@@ -114,7 +114,6 @@ def test_craters_are_dropped_for_one_reason_shallow_without_terrain_or_below_a_d
     shallow = set(np.flatnonzero(field.depth < 0.02 * field.diameter).tolist())
     assert not shallow & set(curation.table.ids.tolist())
     assert curation.dropped["shallow"] >= len(shallow)
-    listed = field.listed()
     moved = replace(listed, latitude_rad=listed.latitude_rad + np.radians(20.0))
     with pytest.raises(TerrainError, match="expected heights under some of"):
         curate(moved, field)

@@ -6,7 +6,9 @@ import math
 from dataclasses import replace
 
 import numpy as np
-import pytest
+from numpy.linalg import norm
+from numpy.testing import assert_allclose, assert_array_equal
+from pytest import approx, fixture, mark, raises
 
 from lunar.datafolder import DataFolder, find_data
 from lunar.ephemeris import Ephemeris, ephemeris_from_states
@@ -66,7 +68,7 @@ events = ["processor_hang at 600", "camera_dark at 1200 for 120"]
 """
 
 
-@pytest.fixture(scope="module")
+@fixture(scope="module")
 def archive(tmp_path_factory):
     out = tmp_path_factory.mktemp("lossy") / "pass"
     return emulate(parse_scenario(SCENARIO), find_data(None), out), out
@@ -101,8 +103,7 @@ def test_the_machine_tells_of_its_faults_and_finishes_the_window(archive):
     # No frame is seen twice, and none goes back in time.
     table = tables["detections"]
     _, first = np.unique(table.ticks, return_index=True)
-    frames = table.columns["frame_number"][first]
-    assert np.all(np.diff(frames) >= 1)
+    assert np.all(np.diff(table.columns["frame_number"][first]) >= 1)
 
 
 def test_the_dumps_are_listed_with_the_times_they_left(archive):
@@ -128,11 +129,10 @@ def test_the_ground_finds_the_time_of_every_frame_from_time_reports(archive, tmp
     true = np.loadtxt(out / "frame_times.csv", delimiter=",", skiprows=1, dtype=np.int64)
     with open_ground(tmp_path / "home") as ground:
         follow_in_process(ground)
-        key = import_archive(ground, out)
-        found = load_pass_inputs(ground, key).detections
+        found = load_pass_inputs(ground, import_archive(ground, out)).detections
         lines = ground.read(correlations_in_force, 1)
     assert [line.boot_count for line in lines] == [1, 2]
-    assert lines[1].drift_ppb == pytest.approx(-3000.0, abs=200.0)
+    assert lines[1].drift_ppb == approx(-3000.0, abs=200.0)
     nearest = np.abs(found.utc_ns[:, None] - true[None, :, 1]).min(axis=1)
     # 0.4 s off without the correlation; a tick is 15 us, and the first line is carried on to the boot.
     assert nearest.max() < 1_000_000
@@ -161,8 +161,7 @@ def test_a_named_anchoring_table_is_uploaded_as_it_is(tmp_path):
     )  # fmt: skip
     named = tmp_path / "three.table"
     named.write_bytes(pack_catalogue_table(table))
-    scenario = parse_scenario(SHORT).with_choices(anchoring_catalogue=named)
-    emulate(scenario, find_data(None), tmp_path / "pass")
+    emulate(parse_scenario(SHORT).with_choices(anchoring_catalogue=named), find_data(None), tmp_path / "pass")
     manifest = json.loads((tmp_path / "pass" / "manifest.json").read_text())
     assert manifest["tables"]["catalogue"] == hashlib.sha256(named.read_bytes()).hexdigest()
 
@@ -171,12 +170,12 @@ def test_an_anchoring_table_that_is_none_is_refused_before_the_flight(tmp_path):
     (tmp_path / "damaged.table").write_bytes(b"no table")
     for name, words in (("none.table", ": expected a table made by linna catalogue curate"), ("damaged.table", "")):
         scenario = parse_scenario(SHORT).with_choices(anchoring_catalogue=tmp_path / name)
-        with pytest.raises(TableError, match=name + words if words else None):
+        with raises(TableError, match=name + words if words else None):
             emulate(scenario, find_data(None), tmp_path / "pass")
     assert not (tmp_path / "pass").exists()
 
 
-@pytest.mark.parametrize("reads", [0, 2])
+@mark.parametrize("reads", [0, 2])
 def test_reads_of_the_truth_are_counted_where_they_happen(reads, tmp_path, monkeypatch):
     """A payload cannot read the truth; a payload with access to it is detected."""
     stolen = []
@@ -208,14 +207,13 @@ def test_reads_of_the_truth_are_counted_where_they_happen(reads, tmp_path, monke
 EPOCH = parse_utc("2029-08-07T00:10:00Z")
 
 
-@pytest.fixture(scope="module")
+@fixture(scope="module")
 def scenario():
     scenario = load_scenario(SHIPPED / "selenita.toml")
-    terrain = replace(scenario.terrain, source="procedural")
-    return replace(scenario, terrain=terrain)
+    return replace(scenario, terrain=replace(scenario.terrain, source="procedural"))
 
 
-@pytest.fixture(scope="module")
+@fixture(scope="module")
 def frame(scenario):
     return render_frame(scenario, DataFolder(), EPOCH)
 
@@ -235,16 +233,16 @@ def test_a_frame_tells_where_and_under_what_sun_it_was_taken_as_json_without_nan
 
 def test_the_same_scenario_and_epoch_give_the_same_picture(scenario, frame):
     again = render_frame(scenario, DataFolder(), EPOCH)
-    np.testing.assert_array_equal(again.image, frame.image)
+    assert_array_equal(again.image, frame.image)
     assert again.labels == frame.labels
 
 
-@pytest.mark.parametrize(
-    ("chosen", "words"),
+@mark.parametrize(
+    "chosen, words",
     [((EPOCH - 10**15,), "at or after the scenario's"), ((EPOCH, "magic"), "fast, raymarch, cycles, found 'magic'")],
 )
 def test_an_epoch_before_the_orbit_and_an_unknown_renderer_are_refused(scenario, chosen, words):
-    with pytest.raises(ScenarioError, match=words):
+    with raises(ScenarioError, match=words):
         render_frame(scenario, DataFolder(), *chosen)
 
 
@@ -260,8 +258,7 @@ def circle():
     u = RATE * TIMES_NS / 1e9
     zero = np.zeros_like(u)
     position = RADIUS_M * np.stack([np.cos(u), np.sin(u), zero], axis=1)
-    velocity = RATE * RADIUS_M * np.stack([-np.sin(u), np.cos(u), zero], axis=1)
-    return ephemeris_from_states(TIMES_NS, position, velocity)
+    return ephemeris_from_states(TIMES_NS, position, RATE * RADIUS_M * np.stack([-np.sin(u), np.cos(u), zero], axis=1))
 
 
 def errors_rtn_m(section, seed):
@@ -275,7 +272,7 @@ def errors_rtn_m(section, seed):
 def test_errors_have_the_declared_sizes():
     """300 draws of a root mean square: its own standard error is 4 %, so that 13 % is three of them."""
     squares = [np.mean(errors_rtn_m(SECTION, seed) ** 2, axis=0) for seed in range(300)]
-    np.testing.assert_allclose(np.sqrt(np.mean(squares, axis=0)), SECTION.sigma_rtn_m, rtol=0.13)
+    assert_allclose(np.sqrt(np.mean(squares, axis=0)), SECTION.sigma_rtn_m, rtol=0.13)
 
 
 def test_the_wrong_orbit_is_an_orbit():
@@ -284,7 +281,7 @@ def test_the_wrong_orbit_is_an_orbit():
     state = np.concatenate([wrong.position_m[0], wrong.velocity_m_s[0]])
 
     def slope(s):
-        return np.concatenate([s[3:], -GM * s[:3] / np.linalg.norm(s[:3]) ** 3])
+        return np.concatenate([s[3:], -GM * s[:3] / norm(s[:3]) ** 3])
 
     worst = 0.0
     for k in range(1, len(TIMES_NS)):
@@ -293,43 +290,38 @@ def test_the_wrong_orbit_is_an_orbit():
             k1 = slope(state)
             k2 = slope(state + 0.5 * h * k1)
             k3 = slope(state + 0.5 * h * k2)
-            k4 = slope(state + h * k3)
-            state = state + h / 6.0 * (k1 + 2.0 * k2 + 2.0 * k3 + k4)
-        worst = max(worst, float(np.linalg.norm(state[:3] - wrong.position_m[k])))
+            state = state + h / 6.0 * (k1 + 2.0 * k2 + 2.0 * k3 + slope(state + h * k3))
+        worst = max(worst, float(norm(state[:3] - wrong.position_m[k])))
     assert np.abs(errors_rtn_m(SECTION, 3)).max() > 5.0
     assert worst < 0.02
 
 
 def test_the_same_seed_gives_the_same_errors_none_the_truth_and_an_offset_adds_in_squares():
-    np.testing.assert_array_equal(errors_rtn_m(SECTION, 1), errors_rtn_m(SECTION, 1))
+    assert_array_equal(errors_rtn_m(SECTION, 1), errors_rtn_m(SECTION, 1))
     assert np.abs(errors_rtn_m(SECTION, 1) - errors_rtn_m(SECTION, 2)).max() > 1.0
     truth = circle()
     assert with_reference_error(truth, ReferenceSection(), 1) is truth
     section = ReferenceSection(position_error_m=40.0, radial_m=30.0, transverse_m=60.0)
-    assert section.sigma_rtn_m == pytest.approx((50.0, math.hypot(40.0, 60.0), 40.0))
+    assert section.sigma_rtn_m == approx((50.0, math.hypot(40.0, 60.0), 40.0))
 
 
-@pytest.mark.parametrize(
-    ("line", "message"),
+@mark.parametrize(
+    "line, message",
     [
         ("radial_m = 10.0", "reference.transverse_m must be at least twice reference.radial_m, found 0.0"),
         ("normal_m = -1.0", "reference.normal_m must be zero or more, found -1.0"),
     ],
 )
 def test_errors_that_no_orbit_has_are_refused(line, message):
-    with pytest.raises(ScenarioError, match=message):
+    with raises(ScenarioError, match=message):
         parse_scenario(f'name = "x"\n[reference]\n{line}\n')
 
 
-@pytest.mark.parametrize(
-    "path", sorted([*SHIPPED.glob("*.toml"), *SHIPPED.glob("suite/*.toml")]), ids=lambda path: path.stem
-)
+@mark.parametrize("path", sorted([*SHIPPED.glob("*.toml"), *SHIPPED.glob("suite/*.toml")]), ids=lambda path: path.stem)
 def test_the_reference_of_a_shipped_scenario_is_not_the_truth(path):
-    text = path.read_text()
-    if "[dataset" in text:
+    if "[dataset" in path.read_text():
         return
-    sigma = load_scenario(path).reference.sigma_rtn_m
-    assert 10.0 <= math.hypot(*sigma) <= 100.0
+    assert 10.0 <= math.hypot(*load_scenario(path).reference.sigma_rtn_m) <= 100.0
 
 
 def test_the_arcs_of_a_flown_ephemeris_are_those_of_the_reference():
@@ -337,11 +329,10 @@ def test_the_arcs_of_a_flown_ephemeris_are_those_of_the_reference():
     one = circle().segments[0]
     first = replace(one, utc_ns=one.utc_ns[:60], tai_ns=None, **states_of(one, slice(None, 60), 1.0))
     second = replace(one, utc_ns=one.utc_ns[59:], tai_ns=None, **states_of(one, slice(59, None), 1.00565))
-    flown = Ephemeris((first, second))
-    found = sample_truth(_truth_of_ephemeris(flown, IauOrientation()), TIMES_NS[[30, 90]])
+    found = sample_truth(_truth_of_ephemeris(Ephemeris((first, second)), IauOrientation()), TIMES_NS[[30, 90]])
     assert found.segments[0].stop_utc_ns == found.segments[1].start_utc_ns == TIMES_NS[59]
-    radii = np.linalg.norm([found.segments[0].position_m[-1], found.segments[1].position_m[0]], axis=1)
-    np.testing.assert_allclose(radii, [RADIUS_M, 1.00565 * RADIUS_M], atol=1.0)
+    radii = norm([found.segments[0].position_m[-1], found.segments[1].position_m[0]], axis=1)
+    assert_allclose(radii, [RADIUS_M, 1.00565 * RADIUS_M], atol=1.0)
 
 
 def states_of(one, part, scale):

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field, replace
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 
 import numpy as np
-import pytest
+from pytest import fixture, raises
 
 from linna.cli import run
 from lunar.datafolder import find_data
@@ -21,7 +21,7 @@ BODY = np.random.default_rng(1).integers(0, 256, 300_000, dtype=np.uint8).tobyte
 SHA256 = hashlib.sha256(BODY).hexdigest()
 
 
-@pytest.fixture(autouse=True)
+@fixture(autouse=True)
 def quick(monkeypatch):
     """Leave out the pauses between attempts."""
     monkeypatch.setattr("pooch.core.time.sleep", lambda _seconds: None)
@@ -60,7 +60,7 @@ class Handler(BaseHTTPRequestHandler):
         pass
 
 
-@pytest.fixture
+@fixture
 def server():
     with ThreadingHTTPServer(("127.0.0.1", 0), Handler) as running:
         running.behaviour = Behaviour()
@@ -78,7 +78,7 @@ def wanted(server, **changes):
 
 
 def refused(match, *wanted, **options):
-    with pytest.raises(DataProductError, match=match):
+    with raises(DataProductError, match=match):
         fetch(*wanted, **options)
 
 
@@ -137,7 +137,7 @@ def test_an_overloaded_server_is_asked_again_and_the_last_status_is_reported(ser
 
 def test_a_server_that_does_not_answer_is_reported_in_one_line(tmp_path):
     nowhere = ProductFile("dem/a.bin", "http://127.0.0.1:9/a.bin")
-    with pytest.raises(DataProductError, match="found no whole transfer in 3 attempts") as caught:
+    with raises(DataProductError, match="found no whole transfer in 3 attempts") as caught:
         fetch(nowhere, tmp_path, attempts=3)
     assert "\n" not in str(caught.value)
 

@@ -4,7 +4,8 @@ import os
 from dataclasses import replace
 
 import numpy as np
-import pytest
+from numpy import array_equal
+from pytest import fixture
 
 from lunar.catalogue import make_catalogue
 from lunar.datafolder import DataFolder
@@ -18,7 +19,7 @@ SCENARIO = Scenario(name="rims", seed=5)
 ALL = np.arange(6)
 
 
-@pytest.fixture(autouse=True)
+@fixture(autouse=True)
 def folder(tmp_path, monkeypatch):
     opened().measured(ALL[:1])  # compiled code comes from its own folder
     # Ground lies next to the folder of compiled code, which builds under test read.
@@ -46,9 +47,9 @@ def test_rims_are_measured_once_and_again_for_other_ground(folder):
     found = rims_of(SCENARIO, first, ALL)
     assert not makes_ground(second)
     again = second.measured(ALL)
-    assert np.array_equal(found.rim_height_m, again.rim_height_m)
-    assert np.array_equal(found.depth_m, again.depth_m)
-    assert np.array_equal(first.rim_tilts_m(ALL), second.rim_tilts_m(ALL))
+    assert array_equal(found.rim_height_m, again.rim_height_m)
+    assert array_equal(found.depth_m, again.depth_m)
+    assert array_equal(first.rim_tilts_m(ALL), second.rim_tilts_m(ALL))
     assert np.isfinite(found.depth_m).all()
     assert first.rim_tilts_m(ALL).all()
     assert not second._slots
@@ -76,7 +77,7 @@ def test_tiles_are_made_once_and_again_for_other_ground(folder, monkeypatch):
 
     monkeypatch.setattr(ProceduralTerrain, "make_heights", counted)
     first = opened()
-    assert np.array_equal(tile(first), tile(opened()))
+    assert array_equal(tile(first), tile(opened()))
     assert made == [first]
     for terrain in (opened("other"), opened("one", 1e-9), opened(""), opened("")):  # two are not known
         tile(terrain)
@@ -84,7 +85,7 @@ def test_tiles_are_made_once_and_again_for_other_ground(folder, monkeypatch):
     for file in folder.glob("tile-*"):
         file.write_bytes(file.read_bytes()[:-1])
     damaged = opened()
-    assert np.array_equal(tile(first), tile(damaged))
+    assert array_equal(tile(first), tile(damaged))
     assert made.pop() is damaged
 
     monkeypatch.setattr(tiles, "FILED_TILES", 1)

@@ -3,7 +3,9 @@
 from dataclasses import replace
 
 import numpy as np
-import pytest
+from numpy import cos, cross, pi, sin
+from numpy.linalg import norm
+from pytest import approx, mark, raises
 
 from lunar.ephemeris import ephemeris_from_states
 from lunar.third_bodies import earth_position_icrf_m
@@ -51,8 +53,7 @@ def test_where_each_packet_lies_in_the_frames_is_right():
     sender = transmitter(dumps=1, each=60)
     dump = sender.dumps[0]
     length = sender.settings.cadu_length
-    frames = len(dump.cadus) // length
-    for lost in range(frames):
+    for lost in range(len(dump.cadus) // length):
         octets = dump.cadus[: lost * length] + dump.cadus[(lost + 1) * length :]
         whole = {
             packet
@@ -78,8 +79,8 @@ LINKS = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("name", sorted(LINKS))
-@pytest.mark.parametrize("coding", ["rs", "none"])
+@mark.parametrize("name", sorted(LINKS))
+@mark.parametrize("coding", ["rs", "none"])
 def test_the_account_of_the_link_is_the_account_of_the_ground(name, coding):
     sender = transmitter(coding)
     section = replace(LINKS[name], coding=coding)
@@ -106,7 +107,7 @@ def test_errors_come_in_bursts_of_the_length_that_is_asked_for():
         lost += account["frames_lost_on_link"]
         frames += account["frames_sent"]
     # Share of time in the bad state of a two-state chain: 0.05 / (0.05 + 0.25); 3 sigma of so many correlated frames.
-    assert lost / frames == pytest.approx(1 / 6, abs=0.03)
+    assert lost / frames == approx(1 / 6, abs=0.03)
 
 
 def test_the_receiver_reports_what_it_accepted_and_whether_it_hears_anybody():
@@ -134,14 +135,13 @@ def circling(hours=4.0):
     """A circular polar orbit at 30 km whose plane holds the Earth at the epoch, in closed form."""
     times = EPOCH + np.arange(-300, int(3600 * hours) + 300, 10) * 10**9
     toward = np.asarray(earth_position_icrf_m(float(tdb_s_from_utc_ns(EPOCH))))
-    u = toward / np.linalg.norm(toward)
-    w = np.cross(u, np.cross([0.0, 0.0, 1.0], u))
-    w /= np.linalg.norm(w)
+    u = toward / norm(toward)
+    w = cross(u, cross([0.0, 0.0, 1.0], u))
+    w /= norm(w)
     rate = np.sqrt(4.9028e12 / 1.7674e6**3)
     angle = rate * (times - EPOCH)[:, None] / 1e9
-    position = 1.7674e6 * (np.cos(angle) * u + np.sin(angle) * w)
-    velocity = 1.7674e6 * rate * (np.cos(angle) * w - np.sin(angle) * u)
-    return ephemeris_from_states(times, position, velocity)
+    position = 1.7674e6 * (cos(angle) * u + sin(angle) * w)
+    return ephemeris_from_states(times, position, 1.7674e6 * rate * (cos(angle) * w - sin(angle) * u))
 
 
 def test_contacts_end_behind_the_limb_of_the_moon_once_an_orbit():
@@ -150,8 +150,8 @@ def test_contacts_end_behind_the_limb_of_the_moon_once_an_orbit():
     every = LinkSection(stations=("goldstone", "madrid", "canberra"), minimum_elevation_deg=5.0)
     in_contact, light_s = contacts(ephemeris, times, every)
     # The plane holds the Earth: hidden for the angle 180 deg - 2 acos(R / r), R / r = 1737.4 / 1767.4, of each orbit.
-    hidden = (np.pi - 2.0 * np.arccos(1737.4 / 1767.4)) / (2.0 * np.pi)
-    assert 1.0 - in_contact.mean() == pytest.approx(hidden, abs=0.04)
+    hidden = (pi - 2.0 * np.arccos(1737.4 / 1767.4)) / (2.0 * pi)
+    assert 1.0 - in_contact.mean() == approx(hidden, abs=0.04)
     assert np.all((light_s > 1.1) & (light_s < 1.4))
     always, way_s = contacts(ephemeris, times, LinkSection())
     assert always.all()
@@ -162,5 +162,5 @@ def test_contacts_end_behind_the_limb_of_the_moon_once_an_orbit():
 
 
 def test_a_station_that_there_is_not_is_named():
-    with pytest.raises(ScenarioError, match=r"expected names of goldstone, .* found 'atlantis'"):
+    with raises(ScenarioError, match=r"expected names of goldstone, .* found 'atlantis'"):
         station("atlantis")

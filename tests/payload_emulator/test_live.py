@@ -11,7 +11,8 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-import pytest
+from numpy.linalg import norm
+from pytest import fixture, mark, raises
 
 from lunar.camera import project_mcmf
 from lunar.datafolder import find_data
@@ -48,7 +49,7 @@ NO_DATA = find_data(None)
 EPOCH = parse_utc("2029-08-07T01:40:00Z")
 
 
-@pytest.fixture(scope="module")
+@fixture(scope="module")
 def flown():
     world = build_world(parse_scenario(SCENARIO), NO_DATA)
     return world, load_scenario_payload(world, NO_DATA)[0]
@@ -110,7 +111,7 @@ def watched(world, loaded):
     assert not thread.is_alive()
 
 
-@pytest.fixture
+@fixture
 def running(flown):
     with watched(*flown) as both:
         yield both
@@ -139,8 +140,8 @@ def test_rings_of_the_catalogue_lie_on_the_rims_of_the_rendered_ground():
     sphere = project_mcmf(*axes, mcmf_from_spherical(craters.latitude_rad, craters.longitude_rad, 0.0))
     shown = np.array([[one["u_px"], one["v_px"]] for one in rings])
     assert len(rings) > 20
-    assert np.median(np.linalg.norm(shown - rims, axis=1)) < 0.2  # px; what is left is the tilt of rims
-    assert np.linalg.norm(shown - sphere, axis=1).max() > 5.0  # px: heights matter
+    assert np.median(norm(shown - rims, axis=1)) < 0.2  # px; what is left is the tilt of rims
+    assert norm(shown - sphere, axis=1).max() > 5.0  # px: heights matter
     assert all(one["minor_px"] <= one["diameter_px"] <= one["major_px"] for one in rings)
 
 
@@ -202,8 +203,7 @@ def test_the_scenario_runs_through_and_the_machine_goes_on(running):
     messages = watcher.until(
         lambda message: message["kind"] == "turn" and message["mode"] == "standby" and live.account.frames == 16
     )
-    frames = [message["frame"] for message in messages if message["kind"] == "frame"]
-    assert frames == list(range(16))
+    assert [message["frame"] for message in messages if message["kind"] == "frame"] == list(range(16))
     assert {message["estimates"]["spherical"]["outcome"] for message in messages if message["kind"] == "frame"} <= {
         "anchored", "multi", "single", "predicted",
     }  # fmt: skip
@@ -228,7 +228,7 @@ def test_a_port_in_use_is_named_and_nothing_stays_open(flown):
     world, loaded = flown
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
-        with pytest.raises(LinkError, match=f"telecommand of earth port {port}: expected a free port"):
+        with raises(LinkError, match=f"telecommand of earth port {port}: expected a free port"):
             LiveSession(world, loaded, has_operator=True, station_ports={"earth": (0, port)})
 
 
@@ -331,7 +331,7 @@ def test_a_reader_that_does_not_read_is_disconnected_and_delays_nobody():
     selector.close()
 
 
-@pytest.mark.parametrize("leave", [socket.socket.close, reset], ids=["closed", "reset"])
+@mark.parametrize("leave", [socket.socket.close, reset], ids=["closed", "reset"])
 def test_words_of_a_client_that_left_without_reading_are_received(leave):
     received = []
     server = Server("console", 0, "127.0.0.1", lambda number, octets: received.append(octets))

@@ -5,6 +5,11 @@ from functools import partial
 
 import numpy as np
 import pytest
+from numpy import cos, cross, degrees, exp, radians
+from numpy.linalg import norm
+from numpy.random import default_rng
+from numpy.testing import assert_allclose, assert_array_equal
+from pytest import approx, fixture, mark
 from scipy.special import chdtri
 
 from lunar.constants import MOON_RADIUS_M
@@ -34,7 +39,7 @@ PARAMETERS = AnchoredParameters(
 )
 
 
-@pytest.fixture
+@fixture
 def case_of(navigation_case):
     return partial(navigation_case, parameters=PARAMETERS)
 
@@ -52,7 +57,7 @@ def test_from_five_kilometres_off_the_orbit_is_held_to_a_hundred_metres_without_
 GOOD = Consistency(6.1, 1.0, (0.95, 0.96, 0.94), 0.01, 40.0, 80.0, 120.0, 0.99, 0.001)
 
 
-@pytest.mark.parametrize(
+@mark.parametrize(
     "fault, words",
     [
         ({"anees": 7.1}, "ANEES 7.10 outside 5.04 to 6.96"),
@@ -81,8 +86,7 @@ def test_errors_of_a_run_differ_for_each_seed(case_of):
 
 
 def test_a_common_pixel_bias_hides_from_the_innovations_and_shows_in_the_errors(case_of):
-    biased = case_of(150, detector=SimulatedDetector(bias_px=(1.0, 0.0)))
-    result = consistency([fly(biased, 3)])
+    result = consistency([fly(case_of(150, detector=SimulatedDetector(bias_px=(1.0, 0.0))), 3)])
     assert result.nis_per_degree <= 1.15
     assert result.anees > 10.0
 
@@ -90,7 +94,7 @@ def test_a_common_pixel_bias_hides_from_the_innovations_and_shows_in_the_errors(
 def test_an_attitude_of_a_degree_neither_diverges_nor_lies(case_of):
     # A wide field of view sees its own attitude: with known errors of the sensor (single frame, 20 craters, 30 km) the
     # place is worse by 1.8 without any attitude; a filter has 93 m (median) at 1 degree.
-    noise = float(np.radians(1.0))
+    noise = float(radians(1.0))
     parameters = replace(PARAMETERS, errors=replace(PARAMETERS.errors, attitude_noise_rad=noise))
     case = case_of(100, attitude_noise_rad=noise, attitude_bias_rad=0.0, parameters=parameters)
     runs = [fly(case, seed) for seed in (21, 22, 23, 24)]
@@ -104,26 +108,22 @@ def test_an_attitude_of_a_degree_neither_diverges_nor_lies(case_of):
     assert 0.9 <= result.nis_per_degree <= 1.1
 
 
-@pytest.mark.parametrize("seed", [1, *(pytest.param(one, marks=pytest.mark.campaign) for one in (2, 3))])
+@mark.parametrize("seed", [1, *(pytest.param(one, marks=mark.campaign) for one in (2, 3))])
 def test_an_unannounced_jump_of_five_kilometres_is_noticed_and_mended(case_of, seed):
-    case = case_of(80, kidnap=Kidnap(50, 5_000.0, announced=False))
-    run = fly(case, seed)
+    run = fly(case_of(80, kidnap=Kidnap(50, 5_000.0, announced=False)), seed)
     assert run.error_m[49] < 300.0
     assert run.error_m[50] > 4_000.0
     assert np.all(run.error_m[58:] < 500.0)
 
 
 def test_an_announced_jump_of_tens_of_kilometres_is_mended_within_four_frames(case_of):
-    case = case_of(40, kidnap=Kidnap(25, 50_000.0, announced=True))
-    run = fly(case, 4)
-    assert np.all(run.error_m[29:] < 500.0)
+    assert np.all(fly(case_of(40, kidnap=Kidnap(25, 50_000.0, announced=True)), 4).error_m[29:] < 500.0)
 
 
 def test_after_hours_without_a_camera_the_first_frames_bring_the_orbit_back(case_of):
     imaging = np.ones(760, dtype=bool)
     imaging[20:740] = False
-    case = case_of(760, imaging=imaging)
-    run = fly(case, 5)
+    run = fly(case_of(760, imaging=imaging), 5)
     assert np.all(run.outcome[20:740] == Outcome.no_image)
     assert np.all(run.error_m[743:] < 500.0)
 
@@ -142,8 +142,7 @@ def test_a_wrong_catalogue_is_refused_and_the_orbit_coasted(case_of):
 def test_false_detections_alone_give_no_fix(case_of):
     blind = SimulatedDetector(recall=(0.0, 0.0, 0.0, 0.0), precision=0.06)
     for sigma, frames in ((100.0, 60), (10_000.0, 6)):
-        case = case_of(frames, detector=blind, start_position_m=sigma, start_velocity_m_s=0.1)
-        run = fly(case, 7)
+        run = fly(case_of(frames, detector=blind, start_position_m=sigma, start_velocity_m_s=0.1), 7)
         assert np.count_nonzero(run.fixed) <= 2
         assert set(run.outcome.tolist()) <= {Outcome.fixed, Outcome.coasted, Outcome.refused}
     # The wide search was tried, found nothing safe, and says so.
@@ -154,13 +153,13 @@ def test_the_same_seed_gives_the_same_run_on_any_number_of_processes(case_of):
     case = case_of(12)
     alone, together = fly_many(case, [1, 2], workers=1), fly_many(case, [1, 2], workers=2)
     for one, other in zip(alone, together, strict=True):
-        np.testing.assert_array_equal(one.error_rtn_m, other.error_rtn_m)
+        assert_array_equal(one.error_rtn_m, other.error_rtn_m)
 
 
 SHIPPED_RUNS, SHIPPED_HOURS = 4, 0.5
 
 
-@pytest.fixture(scope="module")
+@fixture(scope="module")
 def shipped():
     """The standard case with everything as shipped: bias states, catalogue offset, scale, persistence, noise."""
     case = standard_case(DataFolder(), "tuning", SHIPPED_HOURS)
@@ -174,11 +173,11 @@ def shipped_consistency(case):
     return consistency([fly(case, seed) for seed in range(31, 31 + SHIPPED_RUNS)], settle_frames=40)
 
 
-@pytest.mark.parametrize("distorted", [False, True])
+@mark.parametrize("distorted", [False, True])
 def test_the_shipped_filter_knows_its_errors(shipped, distorted):
     case = shipped
     if distorted:
-        drawn = CatalogueErrors(regional_sigma_m=(60.0, 60.0, 10.0), regional_rad=np.radians(10.0))
+        drawn = CatalogueErrors(regional_sigma_m=(60.0, 60.0, 10.0), regional_rad=radians(10.0))
         case = replace(shipped, catalogue_errors=drawn)
     result = shipped_consistency(case)
     # Errors that last count once a run: chi-square of 4 x 6 degrees over 4, from SciPy.
@@ -189,14 +188,13 @@ def test_the_shipped_filter_knows_its_errors(shipped, distorted):
     assert result.fixed_share >= 0.95 and result.wrong_share <= 0.01
 
 
-@pytest.mark.parametrize("believed", [1.0, 0.05])
+@mark.parametrize("believed", [1.0, 0.05])
 def test_craters_that_the_payload_mapped_are_met_again_and_their_errors_known(monkeypatch, believed):
     rows = landmark_map.map_rows
     monkeypatch.setattr(
         landmark_map, "map_rows", lambda made: replace(rows(made), sigma_m=believed * rows(made).sigma_m)
     )
-    case = standard_case(DataFolder(), "tuning", 2.1, catalogued=0.2)
-    run = fly(case, 31)
+    run = fly(standard_case(DataFolder(), "tuning", 2.1, catalogued=0.2), 31)
     result = consistency([run], settle_frames=444)
     assert result.own_share > 0.3 and run.findable.mean() < 4.0  # of twelve craters that are detected
     # A map believed twenty times too much is found out by the errors.
@@ -204,19 +202,19 @@ def test_craters_that_the_payload_mapped_are_met_again_and_their_errors_known(mo
 
 
 def test_a_regional_shift_has_its_size_and_is_alike_over_its_angle():
-    rng = np.random.default_rng(5)
+    rng = default_rng(5)
     # Pairs of places 30 degrees apart on the equator, and 2 degrees.
-    longitude = np.radians(np.array([0.0, 2.0, 30.0]))
-    draws = np.stack([regional_field(np.zeros(3), longitude, np.radians(30.0), rng) for _ in range(300)])
+    longitude = radians(np.array([0.0, 2.0, 30.0]))
+    draws = np.stack([regional_field(np.zeros(3), longitude, radians(30.0), rng) for _ in range(300)])
     fields = np.swapaxes(draws, 1, 2).reshape(-1, 3)
     # 900 draws: a correlation is known to 0.03; chords of 2 and 30 degrees are 0.067 and 0.989 of the memory.
-    assert np.mean(fields**2) == pytest.approx(1.0, abs=0.12)
+    assert np.mean(fields**2) == approx(1.0, abs=0.12)
     together = np.corrcoef(fields.T)
-    assert together[0, 1] == pytest.approx(np.exp(-0.067), abs=0.06)
-    assert together[0, 2] == pytest.approx(np.exp(-0.989), abs=0.12)
+    assert together[0, 1] == approx(exp(-0.067), abs=0.06)
+    assert together[0, 2] == approx(exp(-0.989), abs=0.12)
 
 
-@pytest.mark.parametrize("named", [False, True])
+@mark.parametrize("named", [False, True])
 def test_a_scenario_distorts_the_map_that_is_uploaded_by_the_stated_amount(tmp_path, named):
     scenario, craters = load_scenario("selenita"), crater_world()
     plain = loading._catalogue_octets(scenario, craters)
@@ -232,37 +230,37 @@ def test_a_scenario_distorts_the_map_that_is_uploaded_by_the_stated_amount(tmp_p
     )
     first, second = np.argsort(one.ids), np.argsort(other.ids)
     north = other.latitude_rad[second] - one.latitude_rad[first]
-    east = np.sin(other.longitude_rad[second] - one.longitude_rad[first]) * np.cos(one.latitude_rad[first])
-    assert MOON_RADIUS_M * np.std(north) == pytest.approx(80.0, rel=0.05)
-    assert MOON_RADIUS_M * np.std(east) == pytest.approx(80.0, rel=0.05)
-    np.testing.assert_array_equal(one.sigma_m[first], other.sigma_m[second])
+    east = np.sin(other.longitude_rad[second] - one.longitude_rad[first]) * cos(one.latitude_rad[first])
+    assert MOON_RADIUS_M * np.std(north) == approx(80.0, rel=0.05)
+    assert MOON_RADIUS_M * np.std(east) == approx(80.0, rel=0.05)
+    assert_array_equal(one.sigma_m[first], other.sigma_m[second])
 
 
 def test_slow_errors_wander_with_the_memory_they_are_given():
     elapsed_s = np.full(40_000, 15.0)
-    rng = np.random.default_rng(0)
+    rng = default_rng(0)
     values = montecarlo._wandering(np.zeros(2), 0.5, 150.0, elapsed_s, rng)[200:]
-    assert np.std(values) == pytest.approx(0.5, rel=0.05)
+    assert np.std(values) == approx(0.5, rel=0.05)
     # Ten steps of 15 s: exp(-1).
-    assert np.mean(values[10:] * values[:-10]) / 0.25 == pytest.approx(np.exp(-1.0), abs=0.05)
+    assert np.mean(values[10:] * values[:-10]) / 0.25 == approx(exp(-1.0), abs=0.05)
     still = montecarlo._wandering(np.array([0.3, -0.2]), 0.5, float("inf"), elapsed_s, rng)
-    np.testing.assert_array_equal(still, np.broadcast_to([0.3, -0.2], still.shape))
+    assert_array_equal(still, np.broadcast_to([0.3, -0.2], still.shape))
 
 
 def test_an_acceleration_that_lasts_moves_the_truth_as_it_should(shipped):
     """A nearly constant push across the plane over ten minutes."""
     still = replace(shipped, lasting_m_s2=(0.0, 0.0, 0.0))
     pushed = replace(shipped, lasting_m_s2=(0.0, 0.0, 1e-4), lasting_correlation_s=1e9)
-    rng = np.random.default_rng(0)
-    (here, _), (there, _) = (montecarlo._truth(case, rng, np.random.default_rng(3)) for case in (still, pushed))
-    acceleration = 1e-4 * np.random.default_rng(3).standard_normal(3)[2]
-    np.testing.assert_allclose(there[0, :3], here[0, :3], atol=1e-6)
+    rng = default_rng(0)
+    (here, _), (there, _) = (montecarlo._truth(case, rng, default_rng(3)) for case in (still, pushed))
+    acceleration = 1e-4 * default_rng(3).standard_normal(3)[2]
+    assert_allclose(there[0, :3], here[0, :3], atol=1e-6)
     k = 40  # ten minutes
     normal = rtn_from_inertial(here[k, :3], here[k, 3:])[2]
     rate = 2.0 * np.pi / 6_672.0
     # Across the plane the orbit is an oscillator: a / n^2 (1 - cos n t).
-    expected = acceleration / rate**2 * (1.0 - np.cos(rate * 600.0))
-    assert normal @ (there[k, :3] - here[k, :3]) == pytest.approx(expected, rel=0.12)
+    expected = acceleration / rate**2 * (1.0 - cos(rate * 600.0))
+    assert normal @ (there[k, :3] - here[k, :3]) == approx(expected, rel=0.12)
 
 
 def test_every_error_that_the_filter_allows_for_is_drawn(shipped):
@@ -278,16 +276,16 @@ def test_tracks_differ_and_draw_their_nodes_where_they_say():
         case = standard_case(DataFolder(), track, 0.2)
         longitudes = []
         for seed in range(12):
-            drawn = montecarlo._with_drawn_node(case, np.random.default_rng((seed, 2)))
+            drawn = montecarlo._with_drawn_node(case, default_rng((seed, 2)))
             rotation = case.orientation.mcmf_from_icrf(float(tdb_s_from_utc_ns(case.epoch_utc_ns)))
-            normal = rotation @ np.cross(drawn.position_icrf_m, drawn.velocity_icrf_m_s)
-            node = np.cross(axis, normal)
-            longitudes.append(float(np.degrees(np.arctan2(node[1], node[0]))) % 360.0)
-            inclinations[track] = float(np.degrees(np.arccos(normal[2] / np.linalg.norm(normal))))
-            altitudes[track] = float(np.linalg.norm(drawn.position_icrf_m)) - 1_737.4e3
+            normal = rotation @ cross(drawn.position_icrf_m, drawn.velocity_icrf_m_s)
+            node = cross(axis, normal)
+            longitudes.append(float(degrees(np.arctan2(node[1], node[0]))) % 360.0)
+            inclinations[track] = float(degrees(np.arccos(normal[2] / norm(normal))))
+            altitudes[track] = float(norm(drawn.position_icrf_m)) - 1_737.4e3
         spread = np.ptp(longitudes)
         assert spread > 150.0 if track != "limb" else 75.0 <= min(longitudes) <= max(longitudes) <= 105.0
-    assert inclinations["inclined"] == pytest.approx(60.0, abs=2.0)
-    assert inclinations["limb"] == pytest.approx(80.0, abs=2.0)
-    assert inclinations["test"] == pytest.approx(89.1, abs=2.0)
+    assert inclinations["inclined"] == approx(60.0, abs=2.0)
+    assert inclinations["limb"] == approx(80.0, abs=2.0)
+    assert inclinations["test"] == approx(89.1, abs=2.0)
     assert min(altitudes.values()) > 14e3

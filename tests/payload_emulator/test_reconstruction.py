@@ -5,7 +5,7 @@ import shutil
 from dataclasses import replace
 
 import numpy as np
-import pytest
+from pytest import approx, fixture, mark, raises
 
 from lunar.catalogue import save_catalogue
 from lunar.datafolder import DataFolder
@@ -72,12 +72,12 @@ def received(folder, described):
     return folder
 
 
-@pytest.fixture(scope="module")
+@fixture(scope="module")
 def live(tmp_path_factory):
     return received(tmp_path_factory.mktemp("reconstruction") / "pass", world())
 
 
-@pytest.fixture
+@fixture
 def copy(live, tmp_path):
     shutil.copytree(live, tmp_path / "copy")
     return tmp_path / "copy"
@@ -142,8 +142,8 @@ def with_another_catalogue(folder):
     (folder / CATALOGUE).write_text("".join(lines[:20]))
 
 
-@pytest.mark.parametrize(
-    ("change", "said"),
+@mark.parametrize(
+    "change, said",
     [
         (in_world("elevation_min_deg = 5.0", "elevation_min_deg = 6.0"), "image 0 of .* expected image_crc"),
         (in_world("read_noise_e = 15.0", "read_noise_e = 15.5"), "expected image_crc"),
@@ -157,7 +157,7 @@ def with_another_catalogue(folder):
 )  # fmt: skip
 def test_what_telemetry_does_not_confirm_is_refused(change, said, copy, tmp_path):
     change(copy)
-    with pytest.raises(PayloadError, match=said):
+    with raises(PayloadError, match=said):
         reconstruct(copy, tmp_path / "out", DataFolder(None))
 
 
@@ -208,5 +208,5 @@ def test_rings_lie_where_rims_on_high_ground_are_seen_by_a_tilted_distorted_came
         plane = seen[:, :2] / seen[:, 2:]
         return 255.5 + focal_px * plane * (1.0 - 0.02 * np.sum(plane**2, axis=1, keepdims=True))
 
-    assert uv == pytest.approx(pixels(RIM_M), abs=1e-6)
+    assert uv == approx(pixels(RIM_M), abs=1e-6)
     assert np.max(np.linalg.norm(uv - pixels(0.0), axis=1)) > 10.0

@@ -4,9 +4,10 @@ import json
 import re
 import shutil
 from dataclasses import replace
+from json import loads
 
 import numpy as np
-import pytest
+from pytest import approx, fixture, mark, raises
 
 from ground_service.ground import open_ground
 from ground_service.regression.archives import check_archive, keep_archive
@@ -49,14 +50,14 @@ SCENARIO = short_scenario(75.0, "") + "[disturbances]\noutage_at_s = 25.0\noutag
 NO_IMAGE = 2
 
 
-@pytest.fixture(scope="module")
+@fixture(scope="module")
 def archive(tmp_path_factory):
     folder = tmp_path_factory.mktemp("replay") / "pass"
     emulate(parse_scenario(SCENARIO), DataFolder(), folder, frames_kept=None)
     return folder
 
 
-@pytest.fixture
+@fixture
 def copy(archive, tmp_path):
     shutil.copytree(archive, tmp_path / "copy")
     return tmp_path / "copy"
@@ -65,7 +66,7 @@ def copy(archive, tmp_path):
 def restated(folder, change):
     """Write the manifest of an archive again, changed."""
     path = folder / "manifest.json"
-    manifest = json.loads(path.read_text())
+    manifest = loads(path.read_text())
     change(manifest)
     path.write_text(json.dumps(manifest))
 
@@ -85,7 +86,7 @@ def packets_of(name, octets):
 def test_the_service_renders_the_frames_that_an_archive_lacks(copy, tmp_path):
     """Of the files that a scenario can name, the renderer opens only those that the service refuses."""
     shutil.rmtree(copy / "frames")
-    scenario = parse_scenario(json.loads((copy / "manifest.json").read_text())["scenario_toml"])
+    scenario = parse_scenario(loads((copy / "manifest.json").read_text())["scenario_toml"])
     named = replace(
         scenario,
         detector=replace(scenario.detector, network="/nowhere/network.onnx"),
@@ -110,15 +111,14 @@ def test_frames_are_rendered_with_the_data_that_the_archive_declares(copy, tmp_p
     )
     assert complete_archive(copy, tmp_path / "complete", other)["files"].keys() >= {"frames/000000.png"}
     restated(copy, lambda manifest: manifest["data_sources"].append("height model of Mars"))
-    with pytest.raises(RecordError, match=r"^data product missing: height model of Mars$"):
+    with raises(RecordError, match=r"^data product missing: height model of Mars$"):
         complete_archive(copy, tmp_path / "incomplete", other)
 
 
 def test_received_detections_replace_the_frames_that_an_archive_lacks(copy, tmp_path):
     """A replay from received detections reports the same detections; navigation differs by their resolution only."""
     flown = (copy / "downlink.cadu").read_bytes()
-    kept = with_detections(replace(check_archive(copy), reason="no frames"))
-    assert kept.has_inputs
+    assert with_detections(replace(check_archive(copy), reason="no frames")).has_inputs
     shutil.rmtree(copy / "frames")
     replay_archive(copy, FlightBuild(), tmp_path / "out")
     again = (tmp_path / "out/downlink.cadu").read_bytes()
@@ -142,7 +142,7 @@ def test_a_replay_asks_no_clock_for_what_it_says(archive):
 
 def test_costs_are_reported_for_every_frame_and_stay_out_of_the_downlink(archive, tmp_path):
     summary = replay_archive(archive, FlightBuild(), tmp_path / "out")
-    costs = json.loads((tmp_path / "out/performance.json").read_text())
+    costs = loads((tmp_path / "out/performance.json").read_text())
     assert set(costs["stages"]) == {"network", "detector", "navigation"}
     assert all(len(values) == FRAMES for values in costs["stages"].values())
     assert min(value for i, value in enumerate(costs["stages"]["network"]) if i != NO_IMAGE) > 0.0
@@ -160,17 +160,17 @@ def test_a_frame_that_the_camera_did_not_give_is_recorded_as_such(archive):
 
 def test_an_archive_without_frames_is_rendered_bit_for_bit(copy, archive, tmp_path):
     (copy / "frames/000003.png").unlink()
-    with pytest.raises(RecordError, match="1 missing, the first 3"):
+    with raises(RecordError, match="1 missing, the first 3"):
         replay_archive(copy, FlightBuild(), tmp_path / "refused")
     manifest = complete_archive(copy, tmp_path / "whole", DataFolder())
     assert (tmp_path / "whole/frames/000003.png").read_bytes() == (archive / "frames/000003.png").read_bytes()
-    assert set(manifest["files"]) == set(json.loads((archive / "manifest.json").read_text())["files"])
+    assert set(manifest["files"]) == set(loads((archive / "manifest.json").read_text())["files"])
 
 
 def test_a_scenario_that_renders_something_else_is_refused(copy, tmp_path):
     (copy / "frames/000003.png").unlink()
     restated(copy, lambda m: m.update(scenario_toml=m["scenario_toml"].replace("seed = 7", "seed = 8")))
-    with pytest.raises(RecordError, match="frame 3 rendered from the scenario"):
+    with raises(RecordError, match="frame 3 rendered from the scenario"):
         replay_archive(copy, FlightBuild(), tmp_path / "out", data=DataFolder())
 
 
@@ -178,7 +178,7 @@ def test_an_archive_that_cannot_be_flown_says_why(copy, tmp_path):
     """Another image, detections that are none, samples of a withdrawn instrument, an archive of before."""
 
     def refused(match):
-        with pytest.raises(RecordError, match=match):
+        with raises(RecordError, match=match):
             replay_archive(copy, FlightBuild(), tmp_path / "out")
 
     image, path = copy / "frames/000001.png", copy / "payload/inputs.jsonl"
@@ -197,8 +197,7 @@ def test_an_archive_that_cannot_be_flown_says_why(copy, tmp_path):
 def test_a_parameter_of_older_code_is_dropped_and_reported(copy, tmp_path):
     path = copy / "payload/parameters.toml"
     path.write_text(path.read_text().replace("[detector]\n", "[detector]\nforgotten = 3\n"))
-    summary = replay_archive(copy, FlightBuild(), tmp_path / "out")
-    assert summary["dropped"] == ["detector.forgotten"]
+    assert replay_archive(copy, FlightBuild(), tmp_path / "out")["dropped"] == ["detector.forgotten"]
 
 
 def test_a_build_changes_the_parameters_that_it_names_only(archive, tmp_path):
@@ -207,8 +206,7 @@ def test_a_build_changes_the_parameters_that_it_names_only(archive, tmp_path):
     build = load_flight_build(tmp_path / "build.toml")
     assert not names_command(tmp_path / "build.toml")
     plain = replay_archive(archive, FlightBuild(), tmp_path / "plain")
-    strict = replay_archive(archive, build, tmp_path / "strict")
-    assert strict["detections"] < plain["detections"]
+    assert replay_archive(archive, build, tmp_path / "strict")["detections"] < plain["detections"]
 
 
 def test_a_build_flies_its_own_network(archive):
@@ -227,7 +225,7 @@ def test_a_build_flies_its_own_network(archive):
 def test_a_build_file_of_a_program_is_not_flown_here(tmp_path):
     (tmp_path / "build.toml").write_text('name = "x"\ncommand = ["x", "{archive}", "{out}"]\n')
     assert names_command(tmp_path / "build.toml")
-    with pytest.raises(ParameterError, match="found one with a command"):
+    with raises(ParameterError, match="found one with a command"):
         load_flight_build(tmp_path / "build.toml")
 
 
@@ -237,8 +235,7 @@ def test_parameters_survive_their_file_and_one_can_be_set_by_its_dotted_name():
     assert again == parameters
     assert again.flight.sha256 == parameters.flight.sha256
     assert BuildParameters().flight.anchored.gravity_degree == 100
-    changed = parse_parameters("flight.anchored.gravity_degree = 4")
-    assert changed.flight.anchored.gravity_degree == 4
+    assert parse_parameters("flight.anchored.gravity_degree = 4").flight.anchored.gravity_degree == 4
 
 
 BAD = """
@@ -263,9 +260,9 @@ flight.anchored.limits.highest_radius_m = 1 -> lowest_radius_m: expected at most
 """
 
 
-@pytest.mark.parametrize(("text", "message"), [line.split(" -> ") for line in BAD.strip().splitlines()])
+@mark.parametrize("text, message", [line.split(" -> ") for line in BAD.strip().splitlines()])
 def test_a_bad_parameter_is_refused_with_its_name(text, message):
-    with pytest.raises(ParameterError) as error:
+    with raises(ParameterError) as error:
         parse_parameters(text, source="p.toml")
     assert message in str(error.value) and str(error.value).startswith(("p.toml: ", "p.toml, "))
 
@@ -322,7 +319,7 @@ filter_degree = 8
 """
 
 
-@pytest.fixture(scope="module")
+@fixture(scope="module")
 def flown(tmp_path_factory):
     """A pass with all its frames, and its images, orbit and attitudes as somebody else would give them."""
     folder = tmp_path_factory.mktemp("flown", numbered=True)
@@ -345,7 +342,7 @@ def flown(tmp_path_factory):
 
 
 def inputs(folder):
-    return [json.loads(line) for line in (folder / "payload" / "inputs.jsonl").read_text().splitlines()]
+    return [loads(line) for line in (folder / "payload" / "inputs.jsonl").read_text().splitlines()]
 
 
 def copied(flown, to):
@@ -359,7 +356,7 @@ def test_a_pass_that_is_given_back_shows_the_payload_the_same(flown, tmp_path, c
     out = tmp_path / "again"
     command = ["emulate", "--images", str(flown / "given"), "--evidence", "photographs", "--out", str(out), "--json"]
     assert run(command) == 0
-    summary = json.loads(capsys.readouterr().out)
+    summary = loads(capsys.readouterr().out)
     assert summary["frames"] == summary["frames_kept"] == 3
     assert summary["data"][0].startswith("external images given (000000.png") and summary["warnings"] == []
     first = [item for item in inputs(flown / "pass") if item["frame"] >= 0]
@@ -371,8 +368,7 @@ def test_a_pass_that_is_given_back_shows_the_payload_the_same(flown, tmp_path, c
         np.testing.assert_allclose(other["attitude"][:4], one["attitude"][:4], atol=1e-9)
     assert 'world = "photographs"' in (out / "mission.toml").read_text()
     # Nothing outside the archive is needed to fly it again.
-    replayed = replay_archive(out, FlightBuild(), tmp_path / "replayed")
-    assert replayed["frames"] == 3
+    assert replay_archive(out, FlightBuild(), tmp_path / "replayed")["frames"] == 3
 
 
 def test_frames_whose_sun_is_not_that_of_the_ephemeris_are_named_with_both_azimuths(flown, tmp_path, monkeypatch):
@@ -385,7 +381,7 @@ def test_frames_whose_sun_is_not_that_of_the_ephemeris_are_named_with_both_azimu
     assert [text[9:].split("Z: ")[0] for text in warnings] == ["2029-08-08T02:58:20", "2029-08-08T02:58:40"]
     for text in warnings:
         seen, known = (float(azimuth) for azimuth in re.findall(r"(?:azimuth|at) (\d+) deg", text))
-        assert abs(seen - known) == pytest.approx(180.0, abs=20.0)  # of a few craters
+        assert abs(seen - known) == approx(180.0, abs=20.0)  # of a few craters
     monkeypatch.setattr(emulator, "true_sun_direction", lambda world, position, *_: -position / 1.8e6)
     assert len(sun_warnings(world, detector)) == 3 and "elevation -" in sun_warnings(world, detector)[0]
 
@@ -414,8 +410,8 @@ def test_attitudes_between_two_epochs_lie_on_the_arc_between_them(flown, tmp_pat
     frames = load_external(folder, parse_scenario(TEXT))
     quarter = frames.camera_from_icrf(int(start) + 10_000_000_000)
     # A quarter of forty degrees, whatever the sign of the quaternion.
-    assert np.degrees(np.arccos((np.trace(quarter) - 1.0) / 2.0)) == pytest.approx(10.0, abs=1e-6)
-    assert np.trace(frames.camera_from_icrf(int(start))) == pytest.approx(3.0)
+    assert np.degrees(np.arccos((np.trace(quarter) - 1.0) / 2.0)) == approx(10.0, abs=1e-6)
+    assert np.trace(frames.camera_from_icrf(int(start))) == approx(3.0)
     (folder / "attitude.aem").unlink()
     assert load_external(folder, parse_scenario(TEXT)).camera_from_icrf(int(start)) is None
 
@@ -428,8 +424,8 @@ def edited(name, old, new):
     return edit
 
 
-@pytest.mark.parametrize(
-    ("edit", "words"),
+@mark.parametrize(
+    "edit, words",
     [
         (lambda folder: (folder / "frames.csv").unlink(), "frames.csv: expected a table with columns file and utc"),
         (edited("frames.csv", "file,utc", "name,utc"), "frames.csv, line 2: expected a file and a UTC"),
@@ -457,8 +453,7 @@ def test_a_broken_folder_is_refused_in_one_line(flown, tmp_path, capsys, edit, w
     folder = copied(flown, tmp_path / "given")
     edit(folder)
     assert run(["emulate", "--images", str(folder), "--out", str(tmp_path / "out")]) == 2
-    error = capsys.readouterr().err.strip().splitlines()
-    assert words in error[-1]
+    assert words in capsys.readouterr().err.strip().splitlines()[-1]
     assert not (tmp_path / "out").exists()
 
 
@@ -467,12 +462,12 @@ def test_frames_outside_the_ephemeris_are_refused(flown, tmp_path):
     (folder / "attitude.aem").unlink()
     edited("frames.csv", "000000.png,2029-08-08T02:58:00", "000000.png,2029-08-08T01:30:00")(folder)
     scenario = parse_scenario(TEXT)
-    with pytest.raises(ScenarioError, match="expected states from 2029-08-08T01:30"):
+    with raises(ScenarioError, match="expected states from 2029-08-08T01:30"):
         emulate(scenario, DataFolder(), tmp_path / "out", external=load_external(folder, scenario))
 
 
-@pytest.mark.parametrize(
-    ("arguments", "words"),
+@mark.parametrize(
+    "arguments, words",
     [
         ([], "expected a scenario or --images DIR"),
         (["selenita", "--evidence", "photographs"], "--evidence: expected together with --images"),

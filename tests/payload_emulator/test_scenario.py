@@ -4,7 +4,8 @@ import tomllib
 from dataclasses import replace
 
 import numpy as np
-import pytest
+from numpy.testing import assert_allclose, assert_array_equal
+from pytest import approx, mark, raises
 
 from lunar.catalogue import CraterCatalogue
 from lunar.datafolder import DataFolder, find_data
@@ -29,7 +30,7 @@ from payload_emulator.session.world.world import build_world
 FLOWN = [file for file in sorted(SHIPPED.glob("*.toml")) if "dataset" not in tomllib.loads(file.read_text())]
 
 
-@pytest.mark.parametrize("file", FLOWN, ids=lambda file: file.stem)
+@mark.parametrize("file", FLOWN, ids=lambda file: file.stem)
 def test_each_shipped_scenario_reads_and_survives_a_round_trip(file):
     scenario = load_scenario(file)
     assert parse_scenario(format_scenario(scenario)) == scenario
@@ -91,11 +92,9 @@ name = "x" ; [link] ; clock_errors = ["madrid 1", "madrid 2"] -> link.clock_erro
 """
 
 
-@pytest.mark.parametrize(
-    ("text", "message"), [line.replace(" ; ", "\n").split(" -> ") for line in NOT_FLOWN.splitlines()[1:]]
-)
+@mark.parametrize("text, message", [line.replace(" ; ", "\n").split(" -> ") for line in NOT_FLOWN.splitlines()[1:]])
 def test_what_cannot_be_flown_is_refused(text, message):
-    with pytest.raises(ScenarioError, match="scenario: ") as refusal:
+    with raises(ScenarioError, match="scenario: ") as refusal:
         parse_scenario(text)
     assert message in str(refusal.value)
     assert "\n" not in str(refusal.value)
@@ -122,13 +121,13 @@ WITHOUT_EFFECT = """
 """
 
 
-@pytest.mark.parametrize(
-    ("text", "message"), [line.replace(" ; ", "\n").split(" -> ") for line in WITHOUT_EFFECT.splitlines()[1:]]
+@mark.parametrize(
+    "text, message", [line.replace(" ; ", "\n").split(" -> ") for line in WITHOUT_EFFECT.splitlines()[1:]]
 )
 def test_a_stated_key_without_effect_is_refused_and_an_archive_that_states_all_is_read(tmp_path, text, message):
     file = tmp_path / "a.toml"
     file.write_text(f'name = "x"\n{text}')
-    with pytest.raises(ScenarioError) as refusal:
+    with raises(ScenarioError) as refusal:
         load_scenario(file)
     assert message in str(refusal.value) and str(file) in str(refusal.value)
     archived = parse_scenario(file.read_text())
@@ -159,16 +158,16 @@ def on_board(source, fraction=0.0):
 
 def test_real_craters_are_placed_below_their_rims_where_the_network_sees_them_and_procedural_ones_on_them():
     rims = measured("LU1319381").rim_height_m
-    np.testing.assert_allclose(on_board("LU1319381").rim_height_m - rims, -SEEN_BELOW_RIM_M, atol=1e-9)
+    assert_allclose(on_board("LU1319381").rim_height_m - rims, -SEEN_BELOW_RIM_M, atol=1e-9)
     # Of the order of the measured 16 to 23 m: another sign would double the error of the altitude.
     assert 14.0 <= SEEN_BELOW_RIM_M <= 24.0
-    np.testing.assert_array_equal(on_board("synthetic, seed 1").rim_height_m, measured("").rim_height_m)
+    assert_array_equal(on_board("synthetic, seed 1").rim_height_m, measured("").rim_height_m)
 
 
-@pytest.mark.parametrize("source", ["LU1319381", "synthetic, seed 1"])
+@mark.parametrize("source", ["LU1319381", "synthetic, seed 1"])
 def test_centres_have_the_errors_that_are_added_the_error_of_the_list_is_the_detectors(source):
-    np.testing.assert_array_equal(on_board(source, 0.03).sigma_m[:, :2], 150.0)
-    np.testing.assert_array_equal(on_board(source).sigma_m[:, :2], 10.0)
+    assert_array_equal(on_board(source, 0.03).sigma_m[:, :2], 150.0)
+    assert_array_equal(on_board(source).sigma_m[:, :2], 10.0)
 
 
 BARE = 'name = "x"\n[maneuvers]\nenabled = false\n[dynamics]\ngravity = "builtin"\norientation = "iau"\n'
@@ -204,13 +203,13 @@ def test_a_cartesian_state_flies_the_orbit_of_the_elements_it_came_from():
         text = f'{BARE}[orbit]\nframe = "{frame}"\nposition_km = {position}\nvelocity_km_s = {velocity}\n'
         scenario = parse_scenario(text)
         # Doubles of 1.8e6 m carry 2e-10 m; the factor of 1000 costs one rounding.
-        np.testing.assert_allclose(initial_state_icrf(scenario, gm_m3_s2), icrf, atol=1e-8)
+        assert_allclose(initial_state_icrf(scenario, gm_m3_s2), icrf, atol=1e-8)
         assert parse_scenario(format_scenario(scenario)) == scenario
         ends = [
             propagate_scenario(one, force_model(one, data), 600.0).trajectory.state_after(600.0)
             for one in (elements, scenario)
         ]
-        np.testing.assert_allclose(ends[0][:3], ends[1][:3], atol=1e-5)  # m
+        assert_allclose(ends[0][:3], ends[1][:3], atol=1e-5)  # m
 
 
 def test_an_orbit_into_the_ground_is_propagated_until_then():
@@ -221,7 +220,7 @@ def test_an_orbit_into_the_ground_is_propagated_until_then():
     model = force_model(low, find_data(None))
     orbit, impact = propagate_to_impact(low, model, 30 * 86_400.0)
     lived_s = (impact.utc_ns - low.epoch_utc_ns) / 1e9
-    assert orbit.trajectory.elapsed_s[-1] == pytest.approx(lived_s - 1.0, abs=1e-3)
+    assert orbit.trajectory.elapsed_s[-1] == approx(lived_s - 1.0, abs=1e-3)
     ephemeris, _ = sample(orbit, 60.0)
     assert impact.utc_ns - 61_000_000_000 < ephemeris.stop_utc_ns < impact.utc_ns
     assert propagate_to_impact(low, model, 0.5 * lived_s)[1] is None
@@ -247,7 +246,7 @@ def test_frames_keep_to_the_band_of_the_window():
     world = build_world(SCENARIO, DataFolder())
     latitude, _, _ = spherical_from_mcmf(world.truth.positions_mcmf(world.frame_utc_ns))
     # A frame each 15 s moves the ground point by 0.8 degrees.
-    assert np.degrees([latitude.min(), latitude.max()]) == pytest.approx([-20.0, 50.0], abs=0.9)
+    assert np.degrees([latitude.min(), latitude.max()]) == approx([-20.0, 50.0], abs=0.9)
     assert np.degrees(latitude.min()) >= -20.0 and np.degrees(latitude.max()) <= 50.0
 
 
@@ -265,7 +264,7 @@ def test_a_search_without_a_window_names_the_latitudes_that_lack_terrain(monkeyp
             return np.broadcast_to(np.degrees(latitude_rad) < 30.0, np.shape(longitude_rad))
 
     monkeypatch.setattr(world_module, "open_terrain", lambda *a, **k: Patchy(opened(*a, **k)))
-    with pytest.raises(ScenarioError, match=r"lacks terrain at latitudes (29|30|31)\.\d to (49|50)\.\d deg"):
+    with raises(ScenarioError, match=r"lacks terrain at latitudes (29|30|31)\.\d to (49|50)\.\d deg"):
         build_world(SCENARIO, DataFolder())
     south = replace(SCENARIO, window=replace(SCENARIO.window, latitude_max_deg=28.0))
     assert build_world(south, DataFolder()).frame_utc_ns.size > 20
@@ -273,7 +272,7 @@ def test_a_search_without_a_window_names_the_latitudes_that_lack_terrain(monkeyp
 
 def test_a_search_in_longitudes_that_no_track_crosses_says_so():
     narrow = replace(SCENARIO.window, longitude_min_deg=10.0, longitude_max_deg=11.0)
-    with pytest.raises(ScenarioError, match=r"keeps its swath within longitudes 10\.0 to 11\.0 deg"):
+    with raises(ScenarioError, match=r"keeps its swath within longitudes 10\.0 to 11\.0 deg"):
         build_world(replace(SCENARIO, window=narrow), DataFolder())
 
 
@@ -304,7 +303,7 @@ def test_a_window_before_the_impact_of_the_orbit_is_found_and_the_impact_is_name
     assert format_utc(int(world.frame_utc_ns[0]), 0) == "2029-08-07T01:05:00Z"
     assert world.ends.startswith("the orbit hits the Moon at 2029-08-11T15:5")
     many = parse_scenario(f"{FALLING}[window]\npasses = 900")
-    with pytest.raises(ScenarioError, match=r"within 30\.0 days .* found \d+; the orbit hits the Moon at 2029-08-11"):
+    with raises(ScenarioError, match=r"within 30\.0 days .* found \d+; the orbit hits the Moon at 2029-08-11"):
         build_world(many, DataFolder())
 
 
@@ -335,9 +334,9 @@ duration_s = 600
 
 def test_a_flight_over_a_pole_is_refused_before_it_starts_by_its_first_frame_that_sees_too_far(tmp_path):
     message = r"expected ground within 84 deg of latitude .* found 8\d\.\d+ deg needed by frame \d of 40 at 2029"
-    with pytest.raises(ScenarioError, match=message):
+    with raises(ScenarioError, match=message):
         checked_world(parse_scenario(POLAR), DataFolder())
-    with pytest.raises(ScenarioError, match=message):
+    with raises(ScenarioError, match=message):
         emulate(parse_scenario(POLAR), DataFolder(), tmp_path / "p")
     assert not list(tmp_path.iterdir())
     south = POLAR.replace("00:05:00Z", "00:40:00Z").replace("duration_s = 600", "duration_s = 300")

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-import pytest
+from pytest import mark, raises
 
 from lunar.datafolder import DataFolder
 from payload_emulator.errors import RecordError
@@ -40,7 +40,7 @@ def test_views_stay_views_of_their_memory():
     assert memory[6] == 6
 
 
-@pytest.mark.parametrize(
+@mark.parametrize(
     "value",
     [
         None, True, 2**200, 0.1 + 0.2, -0.0, float("inf"), "µ\n", b"\x00\xff", (1, (2,)), {1, 2}, frozenset({3}),
@@ -79,7 +79,7 @@ def test_known_objects_are_those_of_the_reader():
     network, other = object(), object()
     octets = pack_state("a", {"one": [network]}, {"network": network})
     assert unpack_state(octets, "a", {"network": other})["one"] == [other]
-    with pytest.raises(RecordError, match=r"found damage .*network"):
+    with raises(RecordError, match=r"found damage .*network"):
         unpack_state(octets, "a", {})
 
 
@@ -87,22 +87,22 @@ class Pair(NamedTuple):
     one: int
 
 
-@pytest.mark.parametrize(
+@mark.parametrize(
     "value",
     [lambda: None, Path("x"), Pair(1), np.array([None]), np.zeros(2, "i4,f8")],
     ids=lambda one: type(one).__name__,
 )
 def test_what_cannot_be_kept_is_refused_in_one_line(value):
-    with pytest.raises(RecordError, match=r"state: expected .*, found"):
+    with raises(RecordError, match=r"state: expected .*, found"):
         pack_state("a", {"value": value}, {})
 
 
 def test_the_state_of_another_scenario_or_version_is_refused():
     octets = pack_state("a", {"one": 1}, {})
-    with pytest.raises(RecordError, match="expected the state of scenario b, found that of a"):
+    with raises(RecordError, match="expected the state of scenario b, found that of a"):
         unpack_state(octets, "b", {})
     other = octets.replace(f"version {VERSION}".encode(), b"version 1", 1)
-    with pytest.raises(RecordError, match=f"expected version {VERSION} of the state, found 1"):
+    with raises(RecordError, match=f"expected version {VERSION} of the state, found 1"):
         unpack_state(other, "a", {})
 
 
@@ -119,7 +119,7 @@ def test_a_damaged_file_is_refused_with_its_name(tmp_path):
     places = (3, begin + 2, begin + 100, len(whole) - 2)
     for octets in (*cut, *(whole[:k] + bytes([whole[k] ^ 4]) + whole[k + 1 :] for k in places)):
         path.write_bytes(octets)
-        with pytest.raises(RecordError, match=r"exact: expected the state of a spacecraft process .*, found"):
+        with raises(RecordError, match=r"exact: expected the state of a spacecraft process .*, found"):
             load_state(path, "a", {})
 
 
@@ -131,7 +131,7 @@ def test_a_failure_while_writing_leaves_the_state_before(tmp_path, monkeypatch):
         raise OSError("no space")
 
     monkeypatch.setattr(os, "fsync", fail)
-    with pytest.raises(OSError):
+    with raises(OSError):
         save_state(path, "a", {"one": 2}, {})
     assert load_state(path, "a", {}) == {"one": 1}
 
@@ -168,9 +168,9 @@ null
 """
 
 
-@pytest.mark.parametrize("node", NODES.strip().splitlines())
+@mark.parametrize("node", NODES.strip().splitlines())
 def test_another_document_with_a_fitting_checksum_is_refused_and_calls_nothing(node):
-    with pytest.raises(RecordError, match="found damage"):
+    with raises(RecordError, match="found damage"):
         unpack_state(sealed(["a", json.loads(node), [8]]), "a", {})
 
 
@@ -196,13 +196,13 @@ def test_a_journal_returns_its_entries_and_loses_an_incomplete_last_line(tmp_pat
     assert load_journal(path) == [FIRST, SECOND]
 
 
-@pytest.mark.parametrize("line", [b"[1, 2]", b"text", b'[1, "a", 2, "0g"]'])
+@mark.parametrize("line", [b"[1, 2]", b"text", b'[1, "a", 2, "0g"]'])
 def test_a_line_that_is_no_entry_is_refused_with_its_number(tmp_path, line):
     path = tmp_path / "journal"
     add_to_journal(path, FIRST)
     with path.open("ab") as file:
         file.write(line + b"\n")
-    with pytest.raises(RecordError, match="journal, line 2: expected time, station, number and octets"):
+    with raises(RecordError, match="journal, line 2: expected time, station, number and octets"):
         load_journal(path)
 
 
@@ -239,8 +239,7 @@ def test_a_station_sends_a_number_up_once_and_refuses_without_a_contact():
     station = StationPorts("madrid", "127.0.0.1", receive, keeps=True, taken={3})
     station.telecommand.close()
     replies = station.telecommand = Replies()
-    stream = transmission(256, b"abc") + transmission(3, b"known") + transmission(256, b"abc")
-    for octet in stream:
+    for octet in transmission(256, b"abc") + transmission(3, b"known") + transmission(256, b"abc"):
         station._take(1, bytes([octet]))
     assert sent_up == [(256, b"abc")] and replies.sent == [256, 3, 256]
     has_contact[0] = False
@@ -257,8 +256,7 @@ def test_a_station_sends_a_number_up_once_and_refuses_without_a_contact():
 def test_a_session_repeats_the_newer_transmissions_of_its_journal_at_their_times(tmp_path):
     epoch = parse_scenario(SCENARIO).epoch_utc_ns
     journal = tmp_path / "journal"
-    later = JournalEntry(epoch + 10, "madrid", 512, b"later")
-    for entry in (later, JournalEntry(epoch, "madrid", 256, b"now")):
+    for entry in (JournalEntry(epoch + 10, "madrid", 512, b"later"), JournalEntry(epoch, "madrid", 256, b"now")):
         add_to_journal(journal, entry)
     session = LiveSession(*launch(parse_scenario(SCENARIO), DataFolder(None)), keeps=True, journal_file=journal)
     contacts = session.contacts

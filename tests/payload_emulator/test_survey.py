@@ -3,7 +3,7 @@
 import json
 
 import numpy as np
-import pytest
+from pytest import approx, fixture, mark, raises
 
 from linna.cli import run
 from lunar.catalogue import make_catalogue
@@ -69,26 +69,26 @@ def test_windows_of_all_seeds_are_counted_together_each_by_its_frames():
     assert figures["frames"] == 20
     assert figures["median_m"] == np.median([10, 20, 30, 40] * 2 + np.linspace(50, 60, 12).tolist())
     # Of three windows drawn again, all are the short ones in 8 of 27 cases, the long one three times in 1 of 27.
-    assert figures["median_95_m"] == pytest.approx([25.0, 55.0])
+    assert figures["median_95_m"] == approx([25.0, 55.0])
     assert figures["max_m"] == 60.0
-    assert figures["nees_mean"] == pytest.approx((6.0 + 8.0 + 12.8) / 3.0)
+    assert figures["nees_mean"] == approx((6.0 + 8.0 + 12.8) / 3.0)
     # Chi-square with 18 degrees of freedom (Abramowitz and Stegun, table 26.8): 8.23075 and 31.5264.
-    assert figures["bounds"] == pytest.approx([8.23075 / 3.0, 31.5264 / 3.0], abs=1e-4)
+    assert figures["bounds"] == approx([8.23075 / 3.0, 31.5264 / 3.0], abs=1e-4)
     # Sigmas are too large by the root of the mean per degree, too small likewise; within the bounds nothing is said.
     assert (figures["nees_remark"], "sigmas" in format_survey(figures)) == ("", False)
     for nees, remark in ((1.5, "sigmas 2.0 times too large"), (24.0, "sigmas 2.0 times too small")):
         assert f"NIS 1.00; {remark}\n" in format_survey(summary([session(*[window(nees=nees)] * 3)]))
-    assert figures["nees_above_12_6_share"] == pytest.approx(1.0 / 3.0)
-    assert figures["nees_trend"] == pytest.approx(8.0 - (6.0 + 12.8) / 2.0)
-    assert figures["bias_rtn_m"] == pytest.approx([(8 * 1 + 12 * 5) / 20, 2.0, (8 * 3 - 12) / 20])
-    assert figures["inside_2_sigma"] == pytest.approx({"r": 0.76, "t": 0.5, "n": 0.6})
-    assert figures["nis"] == pytest.approx((3 + 3 + 2 * 12) / 18)
+    assert figures["nees_above_12_6_share"] == approx(1.0 / 3.0)
+    assert figures["nees_trend"] == approx(8.0 - (6.0 + 12.8) / 2.0)
+    assert figures["bias_rtn_m"] == approx([(8 * 1 + 12 * 5) / 20, 2.0, (8 * 3 - 12) / 20])
+    assert figures["inside_2_sigma"] == approx({"r": 0.76, "t": 0.5, "n": 0.6})
+    assert figures["nis"] == approx((3 + 3 + 2 * 12) / 18)
     assert figures["coast_end_p95_m"] == 100.0
     # Coasts after few frames are counted apart; an axis at 2 sigma is within, and a coast is three axes.
     after = [((2.0, 0.1, -2.1), 37, 900.0), ((0.5, 0.5, -0.5), 59, 300.0), ((9.0, 9.0, 9.0), 60, 50.0)]
     coasts = [window(coast_sigmas=sigmas, coast_frames=n, coast_end_m=end_m) for sigmas, n, end_m in after]
     few, many = summary([session(window(), *coasts)])["coasts"]
-    assert few == {"frames_from": 1, "coasts": 2, "max_m": 900.0, "inside_2_sigma": pytest.approx(5 / 6)}
+    assert few == {"frames_from": 1, "coasts": 2, "max_m": 900.0, "inside_2_sigma": approx(5 / 6)}
     assert many == {"frames_from": 60, "coasts": 1, "max_m": 50.0, "inside_2_sigma": 0.0}
     assert figures["fixed_share"] == 18 / 20
     assert (figures["catalogued_share"], figures["recall_5_30_km"]) == (0.25, 0.75)
@@ -107,23 +107,21 @@ def test_recall_is_counted_by_size_and_by_depth_with_the_limits_in_their_groups(
     depth_ratio = np.array([0.08, 0.08, 0.2, 0.0599, 0.06, 0.08, 0.0999, 0.10, 0.2, np.nan])
     catalogue = make_catalogue(np.zeros(10), np.zeros(10), diameter_m, source="test", depth_m=depth_ratio * diameter_m)
     in_image = np.array([7, 6, 4, 5, 5, 9, 4, 8, 5, 10])
-    detected = np.array([7, 1, 4, 2, 1, 9, 4, 3, 5, 0])
-    assert recall_counts(catalogue, np.stack([in_image, detected], axis=1)) == counts(
+    assert recall_counts(catalogue, np.stack([in_image, np.array([7, 1, 4, 2, 1, 9, 4, 3, 5, 0])], axis=1)) == counts(
         (37, 15, 5, 3), (9, 5, 1, 0), (13, 8, 2, 2), (10, 5, 1, 0)
     )
 
 
 def test_what_is_unknown_has_no_figure_and_a_session_without_settled_windows_is_refused():
-    lone = session(window(nis=None, coast_end_m=None)).model_copy(update={"registered_share": 0.0})
-    figures = summary([lone])
+    figures = summary([session(window(nis=None, coast_end_m=None)).model_copy(update={"registered_share": 0.0})])
     assert {figures[name] for name in ("nis", "nees_trend", "coast_end_p95_m")} == {None}
     text = format_survey(figures)
     assert "not registered" in text and "NIS unknown" in text
-    with pytest.raises(ScenarioError, match="expected windows with more than 20 frames"):
+    with raises(ScenarioError, match="expected windows with more than 20 frames"):
         summary([session()])
 
 
-@pytest.fixture
+@fixture
 def survey_of(tmp_path, monkeypatch, capsys):
     monkeypatch.delenv("LINNA_DATA", raising=False)
     monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path / "none"))
@@ -184,8 +182,7 @@ def test_classes_have_the_papers_colours_and_labels_outside_are_not_drawn():
 
 
 def test_a_sheet_has_a_place_for_every_picture_and_its_caption():
-    pictures = [np.full((40, 50, 3), 30 + 50 * n, np.uint8) for n in range(4)]
-    sheet = contact_sheet(pictures, ["a", "b", "c", "d"], 3)
+    sheet = contact_sheet([np.full((40, 50, 3), 30 + 50 * n, np.uint8) for n in range(4)], ["a", "b", "c", "d"], 3)
     assert sheet.shape == (2 * (40 + 22 + 4) + 4, 3 * (50 + 4) + 4, 3)
     assert (sheet[4:44, 58:108] == 80).all()
     # The fourth picture begins the second row.
@@ -195,23 +192,22 @@ def test_a_sheet_has_a_place_for_every_picture_and_its_caption():
 def test_a_picture_is_written_whole_or_not_at_all(tmp_path):
     save_png(np.zeros((8, 8, 3), np.uint16), tmp_path / "a.png")
     assert [file.name for file in tmp_path.iterdir()] == ["a.png"]
-    with pytest.raises(OSError):
+    with raises(OSError):
         save_png(np.zeros((8, 8, 3), np.uint8), tmp_path / "missing" / "a.png")
 
 
-@pytest.mark.parametrize(
-    ("error_m", "frames"),
-    [
-        ([20_000.0, 300.0, 80.0, 60.0, 50.0, 40.0], 2),
-        ([100.0, 90.0, 80.0, 70.0], 1),
-        # One frame that happens to be close is no recovery.
-        ([5_000.0, 400.0, 5_000.0, 5_000.0, 300.0, 200.0, 100.0, 90.0], 5),
-        ([5_000.0, 5_000.0], None),
-        ([], None),
-    ],
-)
-def test_a_recovery_is_the_first_frame_from_which_the_error_stays_small(error_m, frames):
-    assert frames_to_recover(np.array(error_m)) == frames
+# One frame that happens to be close is no recovery.
+ERRORS = """20000 300 80 60 50 40: 2
+100 90 80 70: 1
+5000 400 5000 5000 300 200 100 90: 5
+5000 5000: None
+: None"""
+
+
+@mark.parametrize("row", ERRORS.splitlines())
+def test_a_recovery_is_the_first_frame_from_which_the_error_stays_small(row):
+    errors, frames = row.split(":")
+    assert str(frames_to_recover(np.array(errors.split(), float))) == frames.strip()
 
 
 def test_percentiles_of_each_direction_are_of_absolute_errors_and_unknown_without_any():

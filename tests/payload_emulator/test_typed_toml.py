@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from enum import IntEnum
 from typing import Any, Literal
 
-import pytest
+from pytest import mark, raises
 
 from payload_emulator.session.typed_toml import TableFault, read_table, toml_text
 
@@ -83,27 +83,25 @@ rest = {length_m = "x"} | rest.length_m | a number | 'x'
 """
 
 
-@pytest.mark.parametrize(
-    ("table", "place", "expected", "found"), [line.split(" | ") for line in WRONG.strip().splitlines()]
-)
+@mark.parametrize("table, place, expected, found", [line.split(" | ") for line in WRONG.strip().splitlines()])
 def test_a_wrong_value_is_reported_by_place_expectation_and_finding(table, place, expected, found):
-    with pytest.raises(TableFault) as fault:
+    with raises(TableFault) as fault:
         read_table(Outer, {"name": "a"} | tomllib.loads(table), "top")
     assert (fault.value.place, fault.value.expected, fault.value.found) == (f"top.{place}", expected, found)
     assert fault.value.known == () and fault.value.nearest is None
 
 
 def test_an_unknown_key_a_missing_value_and_a_table_that_is_none_are_reported():
-    with pytest.raises(TableFault) as fault:
+    with raises(TableFault) as fault:
         read_table(Outer, {"name": "a", "inner": {"lenght_m": 1.0}})
     assert (fault.value.place, fault.value.nearest) == ("inner.lenght_m", "length_m")
     assert fault.value.known == ("length_m", "limits")
-    with pytest.raises(TableFault) as fault:
+    with raises(TableFault) as fault:
         read_table(Outer, {"name": "a", "zzz": 1.0})
     assert fault.value.place == "zzz" and fault.value.nearest is None and "count" in fault.value.known
-    with pytest.raises(TableFault, match=r"expected all of name, count, .*, found none"):
+    with raises(TableFault, match=r"expected all of name, count, .*, found none"):
         read_table(Outer, {})
-    with pytest.raises(TableFault, match="top: expected a table, found 3"):
+    with raises(TableFault, match="top: expected a table, found 3"):
         read_table(Outer, 3, "top")
 
 
@@ -117,7 +115,7 @@ def test_bounds_hold_for_numbers_by_their_name_also_in_lists():
         ({"length_m": -1}, "length_m: expected a finite number from 0, found -1"),
         ({"length_m": float("nan")}, "length_m: expected a finite number from 0, found nan"),
     ):
-        with pytest.raises(TableFault, match=message):
+        with raises(TableFault, match=message):
             read_table(Inner, table, bounds=bounds)
 
 

@@ -30,8 +30,7 @@ class Tab:
             message = self._receive()
             if message.get("id") == self._number:
                 assert "error" not in message, message
-                result = message["result"]
-                return result
+                return message["result"]
 
     def open(self, path):
         """Go to a file and wait until it is loaded."""

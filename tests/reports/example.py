@@ -6,6 +6,9 @@ a single-frame fix.
 """
 
 import numpy as np
+from numpy import cos, degrees, exp, nan, pi, sin
+from numpy.linalg import norm
+from numpy.random import default_rng
 
 from reports.values import (
     AnchorRead,
@@ -53,25 +56,25 @@ FOCAL_PX = 147.80
 
 def _unit_track(elapsed_s):
     """Unit position and direction of motion, (n, 3) each."""
-    angle = np.radians(-62.0) + 2.0 * np.pi * elapsed_s[:, None] / PERIOD_S
+    angle = np.radians(-62.0) + 2.0 * pi * elapsed_s[:, None] / PERIOD_S
     node, north = np.array([0.44, -0.90, 0.0]), np.array([0.03, 0.01, 1.0])
-    return np.cos(angle) * node + np.sin(angle) * north, np.cos(angle) * north - np.sin(angle) * node
+    return cos(angle) * node + sin(angle) * north, cos(angle) * north - sin(angle) * node
 
 
 def _altitude_m(elapsed_s):
-    angle = 2.0 * np.pi * elapsed_s / PERIOD_S
-    return np.asarray(30_700.0 - 9_800.0 * np.cos(angle - 0.6) + 1_900.0 * np.sin(3.1 * angle))
+    angle = 2.0 * pi * elapsed_s / PERIOD_S
+    return np.asarray(30_700.0 - 9_800.0 * cos(angle - 0.6) + 1_900.0 * sin(3.1 * angle))
 
 
 def _geodetic(position_m):
-    radius = np.linalg.norm(position_m, axis=-1)
-    latitude = np.degrees(np.arcsin(position_m[:, 2] / radius))
-    longitude = np.degrees(np.arctan2(position_m[:, 1], position_m[:, 0])) % 360.0
+    radius = norm(position_m, axis=-1)
+    latitude = degrees(np.arcsin(position_m[:, 2] / radius))
+    longitude = degrees(np.arctan2(position_m[:, 1], position_m[:, 0])) % 360.0
     return latitude, longitude, radius - RADIUS_M
 
 
 def _quantiles(error_rtn_m, drift_percent, path_m):
-    length = np.linalg.norm(error_rtn_m, axis=1)
+    length = norm(error_rtn_m, axis=1)
     length = length[np.isfinite(length)]
     if not len(length):
         return NavigationStatistics()
@@ -97,8 +100,8 @@ def _odometry(rng, imaging, drift_m):
     trigger = np.where(np.cumsum(starts) == 1, "initialization", "time_gap")
     walked = np.cumsum(rng.normal(drift_m, drift_m, (n, 3)), axis=0)
     error = walked - walked[np.maximum.accumulate(np.where(starts, np.arange(n), 0))]
-    before = np.where(starts & (trigger == "time_gap"), np.linalg.norm(drift_m) * 60.0, np.nan)
-    error[~imaging] = np.nan
+    before = np.where(starts & (trigger == "time_gap"), norm(drift_m) * 60.0, nan)
+    error[~imaging] = nan
     resets = int(starts.sum())
     return {
         "error_rtn_m": error,
@@ -123,7 +126,7 @@ def _filter(rng, imaging, cadence_s):
     outcome = np.where(matched > 0, fixed, np.where(imaging, "coasted", "no_image"))
     return {
         "error_rtn_m": error, "sigma_rtn_m": sigma, "outcome": tuple(outcome.tolist()), "matched": matched,
-        "nis": np.where(matched > 0, rng.chisquare(np.maximum(2 * matched, 1)), np.nan), "nis_dof": 2 * matched,
+        "nis": np.where(matched > 0, rng.chisquare(np.maximum(2 * matched, 1)), nan), "nis_dof": 2 * matched,
         "nees": np.sum((error / sigma) ** 2, axis=1), "time_since_fix_s": age, "wrong_fixes": 0, "anchor_reads": 0,
         "anchor_reads_after_start": 0,
     }  # fmt: skip
@@ -131,7 +134,7 @@ def _filter(rng, imaging, cadence_s):
 
 def crater_image(seed):
     """A gray frame of 512 by 512 pixels with shaded bowls, and their centres and diameters in pixels."""
-    rng = np.random.default_rng(seed)
+    rng = default_rng(seed)
     gray = rng.normal(118.0, 5.0, (512, 512))
     u, v, diameter = rng.uniform(20, 492, 14), rng.uniform(20, 492, 14), rng.choice([15, 22, 30, 44, 70], 14)
     rows, columns = np.mgrid[0:512, 0:512]
@@ -147,7 +150,7 @@ def size_class(diameter_px):
 
 def gallery_frame(seed, frame_number=1, utc_ns=None):
     image, (u, v, diameter) = crater_image(seed)
-    rng = np.random.default_rng(seed + 1)
+    rng = default_rng(seed + 1)
     seen = rng.random(len(u)) < 0.72
     false = int(rng.integers(0, 3))
     found_u, found_v, found_d = (
@@ -163,11 +166,11 @@ def gallery_frame(seed, frame_number=1, utc_ns=None):
 
 
 def detector_score(seed=3):
-    rng = np.random.default_rng(seed)
+    rng = default_rng(seed)
     n = 2_400
     azimuth = rng.uniform(-45.0, 45.0, n) % 360.0
     u, v = rng.uniform(0, 511, (2, n))
-    du, dv = rng.normal(0.0, 1.2, (2, n)) + 0.2 * np.array([np.sin(azimuth), -np.cos(azimuth)])
+    du, dv = rng.normal(0.0, 1.2, (2, n)) + 0.2 * np.array([sin(azimuth), -cos(azimuth)])
     threshold = np.linspace(0.05, 0.95, 46)
     curves = tuple(
         PrecisionRecallCurve(label, threshold, 1 - 0.2 * (1.35 - threshold) ** 2.2, best * (1 - threshold**3.2))
@@ -193,7 +196,7 @@ def detector_score(seed=3):
 
 def pass_report(seed=7, *, hours=37.1 / 60.0, cadence_s=15.0, gallery=6, worst=10):
     """A complete pass report; with ``hours=24`` a whole day of windows between 60 degrees south and north."""
-    rng = np.random.default_rng(seed)
+    rng = default_rng(seed)
     n = max(1, round(hours * 3600.0 / cadence_s))
     elapsed = np.arange(n) * cadence_s + 40.0
     utc_ns = START_UTC_NS + (elapsed * 1e9).astype(np.int64)
@@ -208,7 +211,7 @@ def pass_report(seed=7, *, hours=37.1 / 60.0, cadence_s=15.0, gallery=6, worst=1
         TimeSpan(int(utc_ns[a]) - half, int(utc_ns[b - 1]) + half) for a, b in zip(edges[::2], edges[1::2], strict=True)
     )
     path = float(n * cadence_s * 1_636.0)
-    sun = 10.0 + 4.0 * np.sin(elapsed / 300.0)
+    sun = 10.0 + 4.0 * sin(elapsed / 300.0)
     terrain = tuple(np.where(np.abs(latitude) < 22, "mare", "highland"))
 
     paper = _odometry(rng, imaging, (55.0, 400.0, 130.0))
@@ -216,10 +219,10 @@ def pass_report(seed=7, *, hours=37.1 / 60.0, cadence_s=15.0, gallery=6, worst=1
     anchored = _filter(rng, imaging, cadence_s)
     seen = {"sun_elevation_deg": sun, "terrain": terrain}
     hours_in = (elapsed - elapsed[0]) / 3600.0
-    wave = 2.0 * np.pi * elapsed / PERIOD_S
-    growth = np.stack([1 - np.cos(wave), 1 + 0.35 * np.sin(wave), np.ones(n)], axis=1) * hours_in[:, None]
+    wave = 2.0 * pi * elapsed / PERIOD_S
+    growth = np.stack([1 - cos(wave), 1 + 0.35 * sin(wave), np.ones(n)], axis=1) * hours_in[:, None]
     snapshot = rng.normal(0.0, [95.0, 120.0, 118.0], (n, 3))
-    snapshot[anchored["matched"] == 0] = np.nan
+    snapshot[anchored["matched"] == 0] = nan
     lengths = np.array([100e3, 200e3, 500e3, 1e6, 2e6])
 
     def sweep(base, slope):
@@ -260,7 +263,7 @@ def pass_report(seed=7, *, hours=37.1 / 60.0, cadence_s=15.0, gallery=6, worst=1
     map_n = int(900 * max(1.0, hours / 2))
     pick = rng.integers(0, n, map_n)
     seen_often = rng.integers(1, 7, map_n)
-    stripes = 128 + 40 * np.sin(np.add.outer(np.arange(180) / 7.0, np.arange(360) / 11.0))
+    stripes = 128 + 40 * sin(np.add.outer(np.arange(180) / 7.0, np.arange(360) / 11.0))
     fast = utc_ns[:: max(1, n // 400)]
     power_w = 3.2 + 0.8 * imaging[:: max(1, n // 400)]
     known = ReceptionQuality("madrid", "mission", 100, 99, 27, 2.5e-5, 1, 129_900, 0, START_UTC_NS, START_UTC_NS + 60)
@@ -359,7 +362,7 @@ def _changed_track(i):
 
 def regression_report(seed=12, count=24):
     """A candidate that is better on the whole and worse in a few passes."""
-    rng = np.random.default_rng(seed)
+    rng = default_rng(seed)
     return RegressionReport(
         title="Build 0.2.0 against 0.1.0",
         regression_id="R-17",
@@ -410,9 +413,9 @@ def detector_report(seed=13):
             SigmaBin("14–20 km up", 210, 1.40, 1.33, 0.655, 0.941),
         ),
         training=(
-            TrainingCurve("training loss", epoch, 3.0 * np.exp(-epoch / 12) + 0.4),
-            TrainingCurve("validation loss", epoch, 3.1 * np.exp(-epoch / 11) + 0.55),
-            TrainingCurve("validation F1", epoch, 0.78 - 0.6 * np.exp(-epoch / 8)),
+            TrainingCurve("training loss", epoch, 3.0 * exp(-epoch / 12) + 0.4),
+            TrainingCurve("validation loss", epoch, 3.1 * exp(-epoch / 11) + 0.55),
+            TrainingCurve("validation F1", epoch, 0.78 - 0.6 * exp(-epoch / 8)),
         ),
         cost={"Median latency": "6.4 ms, one thread", "Model": "3.8 MB", "Peak memory": "122 MB"},
         gallery=tuple(gallery_frame(seed + 7 * i, i) for i in range(3)),

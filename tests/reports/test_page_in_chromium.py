@@ -3,13 +3,13 @@
 import base64
 import dataclasses
 
-import pytest
+from pytest import fixture, mark
 
 from reports.render import render_html
 from tests.reports import example
 from tests.reports.browser import CHROMIUM, tab
 
-pytestmark = [pytest.mark.slow, pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this machine")]
+pytestmark = [mark.slow, mark.skipif(CHROMIUM is None, reason="no Chromium on this machine")]
 
 # WCAG 2.1 contrast of text against the ground of the page, for the page and its figures.
 _CONTRAST = """
@@ -32,14 +32,14 @@ _CONTRAST = """
 """
 
 
-@pytest.fixture(scope="module")
+@fixture(scope="module")
 def path(whole_page, tmp_path_factory):
     file = tmp_path_factory.mktemp("page") / "report.html"
     file.write_text(whole_page, encoding="utf-8")
     return file
 
 
-@pytest.fixture(scope="module")
+@fixture(scope="module")
 def browser(path, tmp_path_factory):
     with tab(tmp_path_factory.mktemp("profile")) as page:
         page.size(1280, 900)
@@ -59,19 +59,18 @@ def test_every_figure_is_drawn(browser):
     assert browser.value("[...document.querySelectorAll('svg image')].every(i => i.getBoundingClientRect().width > 50)")
 
 
-@pytest.mark.parametrize("width", [1280, 1000, 800])
+@mark.parametrize("width", [1280, 1000, 800])
 def test_nothing_runs_out_of_the_window(browser, width):
     browser.size(width, 900)
     assert browser.value("document.documentElement.scrollWidth") <= width
     browser.size(1280, 900)
 
 
-@pytest.mark.parametrize("scheme", ["light", "dark"])
+@mark.parametrize("scheme", ["light", "dark"])
 def test_text_and_figures_are_legible_in_both_themes(browser, scheme):
     browser.theme(scheme)
     # 4.5 is WCAG AA for text; labels in the colour of their line are held to the 3 of graphics.
-    weak = browser.value(_CONTRAST.replace("LIMIT", "3.0"))
-    assert weak == []
+    assert browser.value(_CONTRAST.replace("LIMIT", "3.0")) == []
     assert browser.value(_CONTRAST.replace("LIMIT", "4.5").replace(",svg text", "")) == []
     browser.theme("light")
 
@@ -112,7 +111,7 @@ def test_on_paper_no_figure_is_taller_than_a_page_and_paper_is_white(browser):
     assert ground == "rgb(255, 255, 255)"
 
 
-@pytest.mark.parametrize("kind", ["regression", "detector"])
+@mark.parametrize("kind", ["regression", "detector"])
 def test_the_other_reports_are_as_silent_and_as_legible(browser, kind, path):
     other = path.with_name(f"{kind}.html")
     other.write_text(render_html(getattr(example, f"{kind}_report")()), encoding="utf-8")
@@ -157,7 +156,7 @@ _GEOMETRY = """
 """
 
 
-@pytest.mark.parametrize("kind", ["pass", "regression", "detector"])
+@mark.parametrize("kind", ["pass", "regression", "detector"])
 def test_nothing_is_cut_and_every_number_can_be_read(browser, kind, path):
     """At 1,280 px every table is whole; at 390 px tables and figures scroll in their frames, the page does not."""
     other = path.with_name(f"{kind}-geometry.html")

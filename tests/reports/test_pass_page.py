@@ -4,7 +4,7 @@ import dataclasses
 from dataclasses import replace
 
 import numpy as np
-import pytest
+from pytest import fixture, mark, raises
 
 from reports.document import Absent, Cell, Picture, Table
 from reports.drawings import picture_files
@@ -28,7 +28,7 @@ from tests.reports import example
 from tests.reports.page import Page
 
 
-@pytest.fixture(scope="module")
+@fixture(scope="module")
 def page(whole_page):
     return Page(whole_page)
 
@@ -146,8 +146,7 @@ def test_only_false_alarms_of_the_scored_classes_are_marked_as_false(whole_pass)
     nothing = np.zeros(len(frame.detection_u_px), np.bool_)
 
     def marks(size_class):
-        classes = np.full(len(nothing), size_class, np.int64)
-        shown = replace(frame, detection_matched=nothing, detection_class=classes)
+        shown = replace(frame, detection_matched=nothing, detection_class=np.full(len(nothing), size_class, np.int64))
         return draw_svg("g", 3.0, 3.5, lambda c: draw_gallery(c, (shown,), 1), "one frame").count(FALSE_TINT)
 
     assert marks(0) == 1, "one compound path holds all crosses of a colour"
@@ -158,8 +157,7 @@ def test_a_given_reason_replaces_the_usual_one_and_a_pass_without_a_reference_sh
     text = of_pass(not_available={"gallery": "images were not asked for in this window"}).text
     assert "Gallery of detections not available: images were not asked for in this window" in text
     assert "gallery: images were not asked for in this window" in text
-    nothing = np.full((40, 3), np.nan)
-    one = _series(40, error_rtn_m=nothing, outcome=("fixed",) * 30 + ("coasted",) * 10)
+    one = _series(40, error_rtn_m=np.full((40, 3), np.nan), outcome=("fixed",) * 30 + ("coasted",) * 10)
     text = of_pass(navigation=(one,)).text
     assert "Position error not available: no reference ephemeris covers the pass" in text
     assert "Fixed on the catalogue" in text and "75.0 %" in text
@@ -186,7 +184,7 @@ def test_a_pass_of_one_frame_is_reported():
     assert "Of 1 expected" in page.text
 
 
-@pytest.mark.parametrize("changes", [(), (("link.coding", "rs", None),)])
+@mark.parametrize("changes", [(), (("link.coding", "rs", None),)])
 def test_settings_are_compared_with_those_of_the_previous_pass(changes):
     _, _, text = of_pass(comparison=SettingsComparison("W-1", changes)).text.rpartition(
         "those of the previous pass, W-1. "
@@ -214,8 +212,7 @@ def test_single_wild_values_do_not_break_a_page():
     n = 60
     error = np.full((n, 3), 12.0)
     error[[7, 9, 11]] = [[1e12], [np.inf], [0.0]]
-    one = _series(n, error_rtn_m=error, sigma_rtn_m=np.full((n, 3), 1e-9))
-    assert of_pass(navigation=(one,)).left_open == []
+    assert of_pass(navigation=(_series(n, error_rtn_m=error, sigma_rtn_m=np.full((n, 3), 1e-9)),)).left_open == []
 
 
 def test_half_a_downlink_shows_the_share_that_came():
@@ -224,17 +221,17 @@ def test_half_a_downlink_shows_the_share_that_came():
 
 
 def test_arrays_of_different_lengths_and_values_that_are_no_report_are_refused():
-    with pytest.raises(InconsistentReport) as caught:
+    with raises(InconsistentReport) as caught:
         of_pass(navigation=(_series(4, altitude_m=np.zeros(3)),))
     message = str(caught.value)
     assert "'anchored', altitude_m" in message and "(4,)" in message and "(3,)" in message
-    with pytest.raises(InconsistentReport, match="4 labels"):
+    with raises(InconsistentReport, match="4 labels"):
         of_pass(navigation=(_series(4, outcome=("fixed",)),))
-    with pytest.raises(UnknownReportKind, match="dict"):
+    with raises(UnknownReportKind, match="dict"):
         render_html({"title": "not a report"})
 
 
-@pytest.mark.campaign
+@mark.campaign
 def test_a_day_of_passes_stays_under_eight_megabytes():
     report = example.pass_report(hours=24.0)
     assert sum(len(s.utc_ns) for s in report.navigation if s.kind == "estimate") == 3 * 5_760
@@ -341,7 +338,7 @@ def test_what_was_not_made_is_absent_with_its_reason():
     assert not [b for b in empty if isinstance(b, Picture)]
 
 
-@pytest.mark.slow
+@mark.slow
 def test_the_document_is_a_page_and_a_pdf_and_the_same_every_time():
     html, form = render_pages(report())
     assert pdf_of(form, html).startswith(b"%PDF") and "form of the paper" in html.lower()

@@ -10,8 +10,8 @@ from dataclasses import replace
 from functools import partial
 from itertools import pairwise
 
-import pytest
 from pypdf import PdfReader
+from pytest import approx, fixture, raises
 
 from reports import drawings
 from reports.document import Column, Document, Heading, Listing, Paragraph, Picture, Properties, Table
@@ -26,7 +26,7 @@ from tests.reports import example
 _POINTS = 72.0
 
 
-@pytest.fixture(scope="module")
+@fixture(scope="module")
 def small():
     return example.pass_report(hours=0.2, gallery=1, worst=0)
 
@@ -35,7 +35,7 @@ def pdf_pages(made):
     return pdf_of(print_form(made), html_page(made))
 
 
-@pytest.fixture(scope="module")
+@fixture(scope="module")
 def octets(small):
     page, form = render_pages(small)
     return pdf_of(form, page)
@@ -54,7 +54,7 @@ def test_it_is_a_pdf_of_numbered_a4_pages_without_date_and_machine(octets):
     assert len(reader.pages) > 2
     for number, page in enumerate(reader.pages, 1):
         # 210 by 297 mm are 595.3 by 841.9 points; half a point is a fifth of a millimetre.
-        assert [float(v) for v in page.mediabox] == pytest.approx([0, 0, 595.3, 841.9], abs=0.5)
+        assert [float(v) for v in page.mediabox] == approx([0, 0, 595.3, 841.9], abs=0.5)
         assert f"{number} / {len(reader.pages)}" in page.extract_text()
     assert b"CreationDate" not in octets and b"ModDate" not in octets
     assert PdfReader(io.BytesIO(octets)).metadata["/Title"].startswith("Pass report: ")
@@ -103,8 +103,7 @@ def test_a_wide_table_is_set_in_smaller_type():
     """Twenty numeric columns do not overlap: each number starts right of the previous one."""
     columns = tuple(Column(f"c{i}") for i in range(20))
     row = tuple(f"{12_345 + i}" for i in range(20))
-    reader = PdfReader(io.BytesIO(pdf_pages(document(Table("Wide.", columns, (row,))))))
-    text = reader.pages[0].extract_text()
+    text = PdfReader(io.BytesIO(pdf_pages(document(Table("Wide.", columns, (row,)))))).pages[0].extract_text()
     assert all(number in text for number in row)
     places = [text.index(number) for number in row]
     assert all(a < b for a, b in pairwise(places))
@@ -153,7 +152,7 @@ def test_the_process_of_a_report_does_not_keep_what_typesetting_computes():
 
 def test_a_fault_of_typesetting_is_one_line(tmp_path):
     (tmp_path / "main.typ").write_text("#unknown-function()")
-    with pytest.raises(RuntimeError, match=r"^PDF of a report: expected a document, found: .*unknown") as raised:
+    with raises(RuntimeError, match=r"^PDF of a report: expected a document, found: .*unknown") as raised:
         _typeset(tmp_path)
     assert "\n" not in str(raised.value)
 
@@ -245,7 +244,7 @@ def test_an_axis_of_one_tick_shows_what_matplotlib_does():
 
 
 def test_two_processes_draw_as_one_does(small, tmp_path, monkeypatch):
-    """What they cannot draw is left to the process that asks."""
+    """The process that asks draws the rest."""
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "kept"))
     pictures = [one for one in pass_document(small).blocks if isinstance(one, Picture)][:3]
     with drawing_processes(True) as processes:

@@ -119,9 +119,7 @@ def test_ticks_are_round_and_inside_a_label_names_both_days_and_only_long_spans_
     places, labels = TimeScale(start, start + 2_220_000_000_000).ticks()
     assert labels == ["10:15", "10:20", "10:25", "10:30", "10:35", "10:40", "10:45", "10:50"]
     assert places[0] == 60.0
-    start = 1_880_964_840_000_000_000
     assert TimeScale(start, start + 86_400_000_000_000).label() == "UTC, 9–10 August 2029"
-    start = 1_880_964_840_000_000_000
     assert zoom_span(TimeScale(start, start + 2_220_000_000_000), ()) is None
     day = TimeScale(start, start + 86_400_000_000_000)
     arc = TimeSpan(start + 43_000_000_000_000, start + 45_000_000_000_000)

@@ -114,7 +114,6 @@ def test_all_fields_are_there_with_whole_nanoseconds_and_nine_digits_in_the_same
     assert set(PassReport.__dataclass_fields__) <= set(body)
     assert [s["name"] for s in body["navigation"]][:3] == ["paper", "spherical", "anchored"]
     assert body["packets"]["by_apid"]["160"]["name"] == "housekeeping"
-    body = json.loads(to_json(whole_pass))
     assert body["reference"]["utc_ns"][0] == int(whole_pass.navigation[0].utc_ns[0])
     assert isinstance(body["reference"]["utc_ns"][0], int)
     back = np.array(json.loads(to_json(whole_pass))["reference"]["latitude_deg"])
@@ -295,12 +294,10 @@ def test_bias_of_octants_both_scores_and_predicted_uncertainty_are_in_tables():
     words = Page(render_html(example.detector_report())).text
     table = words[words.index("Mean residual by octant of Sun azimuth") :]
     assert "0–45°" in table and "315–360°" in table and "180–225°" not in table
-    words = Page(render_html(example.detector_report())).text
     table = words[words.index("By type of terrain") :]
     assert "precision, ignore-aware" in table and "recall, ignore-aware" in table
     lowland = table[table.index("lowland") :]
     assert lowland.index("0.870") < lowland.index("0.930") < lowland.index("0.610")
-    words = Page(render_html(example.detector_report())).text
     table = words[words.index("Predicted uncertainty") :]
     for figure in ("14–20 km up", "1.33", "0.655", "0.941", "0.683"):
         assert figure in table

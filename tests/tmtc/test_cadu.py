@@ -95,7 +95,6 @@ def test_a_bit_slip_costs_one_frame_and_an_inverted_stretch_is_turned_upright():
     assert sync.start_bits.tolist() == [8 * PERIOD * k - (k > 7) for k in rows]
     assert sync.truncated.tolist() == [PERIOD * 7]
     assert cadu_octets(octets, sync).tolist() == stream.reshape(-1, PERIOD)[rows].tolist()
-    stream = stream_of(20)
     turned = stream.copy()
     turned[8 * PERIOD : 15 * PERIOD] ^= 0xFF
     sync = synchronise(turned, PERIOD)

@@ -3,9 +3,11 @@
 import functools
 
 import numpy as np
-import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from numpy import array_equal, count_nonzero
+from numpy.random import default_rng
+from pytest import mark, raises
 from spacepackets.ccsds.tm_frame import TmFramePrimaryHeader, TmTransferFrame
 
 from tmtc.dictionary.payload import DICTIONARY
@@ -42,7 +44,7 @@ WITHDRAWN = bytes.fromhex(
 
 
 def make_packets(count, seed=0, boot=1, start_s=0):
-    rng = np.random.default_rng(seed)
+    rng = default_rng(seed)
     sequencer = PacketSequencer()
     packets = []
 
@@ -89,10 +91,10 @@ def cadus(spacecraft_id=76, **options):
     return encode_cadus(sent(), spacecraft_id=spacecraft_id, **options)
 
 
-@pytest.mark.parametrize("randomiser", ["none", "legacy", "long"])
-@pytest.mark.parametrize("coding", ["rs", "none"])
-@pytest.mark.parametrize("checksum", [True, False])
-@pytest.mark.parametrize("frame_length", [223, 892, 1000, 1115])
+@mark.parametrize("randomiser", ["none", "legacy", "long"])
+@mark.parametrize("coding", ["rs", "none"])
+@mark.parametrize("checksum", [True, False])
+@mark.parametrize("frame_length", [223, 892, 1000, 1115])
 def test_what_is_sent_comes_back_and_the_settings_are_found_out(randomiser, coding, checksum, frame_length):
     chosen = {"frame_length": frame_length, "coding": coding, "randomiser": randomiser}
     decoded = read(cadus(**chosen, checksum=checksum))
@@ -101,9 +103,9 @@ def test_what_is_sent_comes_back_and_the_settings_are_found_out(randomiser, codi
     assert {name: getattr(decoded.settings, name) for name in chosen} == chosen
 
 
-@pytest.mark.parametrize("errors", [8, 16])
-@pytest.mark.parametrize("dual_basis", [True, False])
-@pytest.mark.parametrize("interleave", [1, 2, 3, 4, 5, 8])
+@mark.parametrize("errors", [8, 16])
+@mark.parametrize("dual_basis", [True, False])
+@mark.parametrize("interleave", [1, 2, 3, 4, 5, 8])
 def test_every_reed_solomon_setting_is_found_out(errors, dual_basis, interleave):
     frame_length = (255 - 2 * errors - 3) * interleave
     wanted = LinkSettings(
@@ -125,8 +127,7 @@ def test_a_cadu_of_the_default_link_is_1279_octets_and_its_frame_what_spacepacke
     theirs = [TmTransferFrame.unpack(frame, 512, has_error_control_field=True) for frame in frames]
     assert [f.primary_header.vc_frame_count for f in theirs] == list(range(len(frames)))
     assert {f.primary_header.vc_id for f in theirs} == {2}
-    stream = b"".join(bytes(f.data_field) for f in theirs)
-    assert stream.startswith(b"".join(sent()[:40]))
+    assert b"".join(bytes(f.data_field) for f in theirs).startswith(b"".join(sent()[:40]))
 
 
 def test_bare_packets_are_recognised_an_empty_file_is_empty_and_long_packets_span_frames():
@@ -141,7 +142,7 @@ def test_bare_packets_are_recognised_an_empty_file_is_empty_and_long_packets_spa
     assert packets_of(read(encode_cadus(packets, spacecraft_id=1, frame_length=223))) == packets
 
 
-@pytest.mark.parametrize("spare", range(9))
+@mark.parametrize("spare", range(9))
 def test_the_last_frame_is_filled_exactly_however_little_is_left(spare):
     # zone of 215 octets: the packet leaves 0..8, fewer than the seven of the least idle packet among them
     packet = stranger_of(0x11, 207 - spare)
@@ -181,11 +182,11 @@ def test_each_frame_carries_the_control_word_of_the_last_packet_that_began():
     assert packets_of(decoded) == sent() and decoded.complete
     starts = np.cumsum([0, *map(len, sent())])[:-1]
     for frame, word in enumerate(decoded.frames.clcw):
-        begun = int(np.count_nonzero(starts < (frame + 1) * (1115 - 6 - 4 - 2))) - 1
+        begun = int(count_nonzero(starts < (frame + 1) * (1115 - 6 - 4 - 2))) - 1
         assert int(word).to_bytes(4, "big") == clcws[begun]
-    with pytest.raises(ValueRefused, match="one for each packet"):
+    with raises(ValueRefused, match="one for each packet"):
         encoder.encode(sent(), clcw=clcws[1:])
-    with pytest.raises(ValueRefused, match="4 octets"):
+    with raises(ValueRefused, match="4 octets"):
         encoder.encode(sent()[:1], clcw=b"\x01\x00\x00")
 
 
@@ -217,8 +218,7 @@ def test_frames_that_come_twice_or_late_are_not_lost_and_uncorrectable_ones_loca
     frames = [octets[k : k + 1279] for k in range(0, len(octets), 1279)]
     again = frames[:20] + frames[:10] + frames[20:40] + frames[5:15] + frames[40:]
     late = frames[:10] + frames[12:20] + frames[10:12] + frames[20:]
-    lost = [read(b"".join(one)).frames_lost for one in (again, late, late[:30] + late[33:] + late[:5])]
-    assert lost == [0, 0, 3]
+    assert [read(b"".join(one)).frames_lost for one in (again, late, late[:30] + late[33:] + late[:5])] == [0, 0, 3]
     octets = bytearray(cadus())
     octets[5 * 1279 + 10 : 5 * 1279 + 10 + 17 * 5 : 5] = bytes(17)
     decoded = read(bytes(octets))
@@ -263,7 +263,7 @@ def test_attaching_in_mid_stream_or_frame_and_truncation_cost_no_whole_frame():
     found = packets_of(decoded)
     assert found == sent()[len(sent()) - len(found) :]
     starts = np.cumsum([0, *map(len, sent())])
-    assert len(found) == int(np.count_nonzero(starts[:-1] >= 3 * 1107))
+    assert len(found) == int(count_nonzero(starts[:-1] >= 3 * 1107))
     assert decoded.octets["orphaned"] == starts[len(sent()) - len(found)] - 3 * 1107
     assert decoded.crc_errors == 0
     assert read(cadus()[777:]).octets["unsynchronised"] == 1279 - 777
@@ -293,9 +293,9 @@ def test_unknown_packets_are_counted_given_settings_used_and_markers_without_fra
     assert decoded.unknown == 2 and not decoded.complete
     assert decoded.by_apid[0x55] == decoded.by_apid[0x0AE] == 1
     assert WITHDRAWN in set(packets_of(decoded))
-    noise = np.random.default_rng(3).integers(0, 256, (30, 700), dtype=np.uint8)
+    noise = default_rng(3).integers(0, 256, (30, 700), dtype=np.uint8)
     noise[:, :4] = np.frombuffer(ASM, dtype=np.uint8)
-    with pytest.raises(LinkFormatError, match="mostly 700 octets apart"):
+    with raises(LinkFormatError, match="mostly 700 octets apart"):
         read(noise.tobytes())
     wrong = read(cadus(), settings=LinkSettings(randomiser="none", dual_basis=False))
     assert wrong.packets == 0 and wrong.frames_bad == wrong.frame_count
@@ -314,7 +314,7 @@ def test_impossible_settings_are_refused():
         (1, {"frame_length": 2049, "coding": "none"}, ValueRefused, "frame_length"),
         (1, {"frame_length": 1117}, LinkFormatError, "found 1117"),
     ):  # fmt: skip
-        with pytest.raises(error, match=message):
+        with raises(error, match=message):
             cadus(spacecraft_id, **options)
 
 
@@ -358,37 +358,32 @@ def test_any_octets_at_all_are_decoded_or_refused(octets):
             continue
 
 
-HEADERS = (
-    # version 00, spacecraft 0001001100, channel 010, OCF 1 | 5 | 6 | flags 000, segment length id 11, pointer 10
-    ("04C5 05 06 180A", (0, 76, 2, 5, 6, 10, True, False)),
-    ("3FFF FF FF DFFF", (0, 1023, 7, 255, 255, 2047, True, True)),
-    ("C000 00 00 1800", (3, 0, 0, 0, 0, 0, False, False)),
-)
-FIELDS = (
-    "version", "spacecraft_id", "virtual_channel", "master_count", "channel_count", "first_header_pointer", "ocf",
-    "secondary_header",
-)  # fmt: skip
+# version 00, spacecraft 0001001100, channel 010, OCF 1 | 5 | 6 | flags 000, segment length id 11, pointer 10
+HEADERS = """04C50506180A 0 76 2 5 6 10 1 0
+3FFFFFFFDFFF 0 1023 7 255 255 2047 1 1
+C00000001800 3 0 0 0 0 0 0 0"""
+FIELDS = "version spacecraft_id virtual_channel master_count channel_count first_header_pointer ocf secondary_header"
 
 
 def test_headers_are_those_of_the_standard_and_of_spacepackets_and_checksums_hold_until_a_flip():
-    frames = np.frombuffer(bytes.fromhex("".join(octets for octets, _ in HEADERS)), dtype=np.uint8).reshape(3, 6)
-    columns = frame_headers(frames)
-    for k, name in enumerate(FIELDS):
-        assert getattr(columns, name).tolist() == [values[k] for _, values in HEADERS], name
+    octets, *values = zip(*map(str.split, HEADERS.splitlines()), strict=True)
+    columns = frame_headers(np.frombuffer(bytes.fromhex("".join(octets)), dtype=np.uint8).reshape(3, 6))
+    for name, expected in zip(FIELDS.split(), values, strict=True):
+        assert getattr(columns, name).tolist() == [*map(int, expected)], name
     octets = bytes.fromhex("04C5 05 06 180A")
     theirs = TmFramePrimaryHeader.unpack(octets)
     ours = frame_headers(np.frombuffer(octets, dtype=np.uint8).reshape(1, 6))
     assert (theirs.master_channel_id.spacecraft_id, theirs.vc_id) == (ours.spacecraft_id[0], ours.virtual_channel[0])
     assert (theirs.master_ch_frame_count, theirs.vc_frame_count) == (ours.master_count[0], ours.channel_count[0])
     assert theirs.frame_datafield_status.first_header_pointer == ours.first_header_pointer[0]
-    frames = np.random.default_rng(0).integers(0, 256, (5, 100), dtype=np.uint8)
+    frames = default_rng(0).integers(0, 256, (5, 100), dtype=np.uint8)
     append_frame_checksums(frames)
     assert frame_checksums_hold(frames).all()
     frames[3, 50] ^= 1
     assert frame_checksums_hold(frames).tolist() == [True, True, True, False, True]
 
 
-@pytest.mark.parametrize(
+@mark.parametrize(
     "clcw", [Clcw(0, 0), Clcw(63, 255, True, True, True, True, True, 3, 7), Clcw(5, 17, lockout=True, farm_b_counter=2)]
 )
 def test_command_link_control_words_come_back(clcw):
@@ -399,20 +394,20 @@ def test_control_words_idle_data_and_checksums_are_those_of_the_standard():
     # type 0, version 00, status 000, COP 01 | VC 000101, spare 00 |
     # no RF 0, no lock 0, lockout 1, wait 0, retransmit 1, FARM-B 10, spare 0 | 17
     assert pack_clcw(Clcw(5, 17, lockout=True, retransmit=True, farm_b_counter=2)) == bytes.fromhex("01142C11")
-    with pytest.raises(FrameError):
+    with raises(FrameError):
         unpack_clcw(b"\xff\xff\xff\xff")
     # 1 + D + D^2 + D^22 + D^32: thirty-two ones, then the sum of taps
     data = idle_data(1100)
     assert data[:5].hex() == "ffffffff6d"
     bits = np.unpackbits(np.frombuffer(data, dtype=np.uint8)).astype(int)
     n = np.arange(32, bits.size)
-    assert np.array_equal(bits[n], (bits[n - 1] + bits[n - 2] + bits[n - 22] + bits[n - 32]) % 2)
+    assert array_equal(bits[n], (bits[n - 1] + bits[n - 2] + bits[n - 22] + bits[n - 32]) % 2)
     # CRC-16/IBM-3740, the "CRC-16/CCITT-FALSE" of ECSS-E-ST-70-41C annex B: check value of "123456789"
     assert crc16(b"123456789") == 0x29B1
 
 
 # ECSS-E-ST-70-41C annex B.1.5 (verification of compliance)
-@pytest.mark.parametrize("row", ["0000 1D0F", "000000 CC9C", "ABCDEF01 04A2", "1456F89A0001 7FD5"])
+@mark.parametrize("row", ["0000 1D0F", "000000 CC9C", "ABCDEF01 04A2", "1456F89A0001 7FD5"])
 def test_the_checksum_agrees_with_the_vectors_of_the_standard(row):
     data, checksum = map(bytes.fromhex, row.split())
     assert crc16(data) == int.from_bytes(checksum, "big")
@@ -422,9 +417,9 @@ def test_a_checksum_leaves_no_remainder_and_a_wrong_one_is_reported_with_both_va
     octets = append_crc(b"any octets")
     assert crc16(octets) == 0
     check_crc(octets, "test")
-    with pytest.raises(ChecksumError, match="expected checksum 0x29B1, found 0x0000"):
+    with raises(ChecksumError, match="expected checksum 0x29B1, found 0x0000"):
         check_crc(b"123456789\0\0", "test")
-    with pytest.raises(TruncatedPacket):
+    with raises(TruncatedPacket):
         check_crc(b"\0", "test")
 
 
@@ -438,26 +433,26 @@ SEQUENCES = {
 }
 
 
-@pytest.mark.parametrize("name", SEQUENCES)
+@mark.parametrize("name", SEQUENCES)
 def test_sequences_begin_as_the_standards_print_them_and_repeat_after_their_full_period_only(name):
     start, bits = SEQUENCES[name]
     assert sequence(name, len(start) // 2).tobytes().hex().upper() == start
     stream = np.unpackbits(sequence(name, (2 * bits + 7) // 8 + 1))
-    assert np.array_equal(stream[:bits], stream[bits : 2 * bits])
-    assert np.count_nonzero(stream[:bits]) == (bits + 1) // 2  # a maximal sequence has one more one than zeros
+    assert array_equal(stream[:bits], stream[bits : 2 * bits])
+    assert count_nonzero(stream[:bits]) == (bits + 1) // 2  # a maximal sequence has one more one than zeros
     for divisor in (3, 5, 17):
         if bits % divisor == 0:
-            assert not np.array_equal(stream[: bits - bits // divisor], stream[bits // divisor : bits])
+            assert not array_equal(stream[: bits - bits // divisor], stream[bits // divisor : bits])
 
 
-@pytest.mark.parametrize("name", ["none", "legacy", "long", "telecommand"])
+@mark.parametrize("name", ["none", "legacy", "long", "telecommand"])
 def test_randomising_twice_gives_the_frames_back(name):
-    frames = np.random.default_rng(0).integers(0, 256, (3, 1275), dtype=np.uint8)
-    assert np.array_equal(randomise(randomise(frames, name), name), frames)
+    frames = default_rng(0).integers(0, 256, (3, 1275), dtype=np.uint8)
+    assert array_equal(randomise(randomise(frames, name), name), frames)
 
 
 def test_an_unknown_randomiser_is_refused():
-    with pytest.raises(LinkFormatError, match="expected one of none, legacy, long, telecommand, found 'xyz'"):
+    with raises(LinkFormatError, match="expected one of none, legacy, long, telecommand, found 'xyz'"):
         sequence("xyz", 4)
 
 
@@ -480,7 +475,7 @@ def test_stretches_and_channels_of_control_words_add_up_and_others_are_passed_ov
     found = [(one.virtual_channel, one.frames, one.changes, one.report_value) for one in seen]
     assert found == [(0, 2, 0, 9), (3, 2, 1, 2)]
     assert uplink_seen(words(0, TYPE_TWO_REPORT)) == () == uplink_seen(words())
-    rng = np.random.default_rng(5)
+    rng = default_rng(5)
     for _ in range(50):
         stream = words(*(Clcw(0, int(n), lockout=bool(n == 1)) for n in rng.integers(0, 3, 60)))
         first, last = sorted(rng.choice(np.arange(1, 60), 2, replace=False).tolist())

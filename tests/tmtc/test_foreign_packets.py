@@ -302,7 +302,6 @@ def test_json_and_csv_hold_the_records_in_order_with_names_and_times_and_no_pack
     assert list(records[1]["items"][0]) == ["u_px", "v_px", "diameter_px", "score", "size_class", "sigma_px"]
     assert records[2]["items"] == []
     assert records[3]["sigma_rtn_m"] == [4.0, 5.0, None]
-    records = packet_records(tables())
     assert json.loads(format_records(records, "json")) == records
     rows = list(csv.DictReader(io.StringIO(format_records(records, "csv").decode())))
     assert [row["frame_number"] for row in rows] == ["0", "1", "1", "1"]

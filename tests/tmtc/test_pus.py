@@ -1,7 +1,7 @@
 """"""
 
 import numpy as np
-import pytest
+from pytest import mark, raises
 from spacepackets.ccsds import PacketType, SpacePacketHeader
 from spacepackets.ecss import PusTc, PusTm
 
@@ -63,18 +63,18 @@ def test_headers_come_back_with_their_request_id_and_another_version_is_refused(
     telecommand = TcSecondaryHeader(255, 255, 15, 65535)
     assert unpack_tc_header(pack_tc_header(telecommand)) == telecommand
     for unpack in (unpack_tm_header, unpack_tc_header):
-        with pytest.raises(MalformedPacket, match="expected PUS version 2, found 1"):
+        with raises(MalformedPacket, match="expected PUS version 2, found 1"):
             unpack(b"\x10" + bytes(13))
-    with pytest.raises(TruncatedPacket):
+    with raises(TruncatedPacket):
         unpack_tm_header(bytes(13))
     packet = DICTIONARY.pack_command("test_connection", {}, sequence_count=0x123)
     assert request_id(packet) == 0x18A0C123
     assert SpacePacketHeader.unpack(packet[:6]).packet_id.raw() == 0x18A0
 
 
-@pytest.mark.parametrize("apid", [0, 0x0A0, 0x7FF])
-@pytest.mark.parametrize("count", [0, 16383])
-@pytest.mark.parametrize("packet_type", [0, 1])
+@mark.parametrize("apid", [0, 0x0A0, 0x7FF])
+@mark.parametrize("count", [0, 16383])
+@mark.parametrize("packet_type", [0, 1])
 def test_headers_agree_with_spacepackets(apid, count, packet_type):
     octets = pack_packet(apid, b"abc", sequence_count=count, packet_type=packet_type)
     theirs = SpacePacketHeader.unpack(octets[:6])
@@ -90,21 +90,21 @@ def test_values_that_do_not_fit_are_refused():
         (2048, b"x", 0, r"expected 0\.\.2047, found 2048"), (1, b"x", 16384, "16384"), (1, b"", 0, None),
         (1, bytes(65537), 0, None),
     ):  # fmt: skip
-        with pytest.raises(ValueRefused, match=message):
+        with raises(ValueRefused, match=message):
             pack_packet(apid, data, sequence_count=count)
 
 
 def test_damaged_headers_are_refused():
-    with pytest.raises(TruncatedPacket, match="expected 6 octets, found 5"):
+    with raises(TruncatedPacket, match="expected 6 octets, found 5"):
         unpack_primary_header(bytes(5))
-    with pytest.raises(MalformedPacket, match="expected version 0, found 7"):
+    with raises(MalformedPacket, match="expected version 0, found 7"):
         unpack_primary_header(b"\xff" * 6)
 
 
 def test_idle_packets_have_the_idle_apid_and_counts_of_each_apid_wrap_at_14_bits():
     header = unpack_primary_header(idle_packet(7))
     assert (header.apid, header.secondary_header, header.packet_length) == (0x7FF, False, 7)
-    with pytest.raises(ValueRefused):
+    with raises(ValueRefused):
         idle_packet(6)
     sequencer = PacketSequencer()
     counts = [sequencer.next(1) for _ in range(16386)]
@@ -126,7 +126,7 @@ def through_packets(parts):
         yield DICTIONARY.unpack(DICTIONARY.pack(name, values, ticks=k, sequence_count=k))
 
 
-@pytest.mark.parametrize("part_length", [1000, 9999, 10_000, 20_000])
+@mark.parametrize("part_length", [1000, 9999, 10_000, 20_000])
 def test_what_is_split_comes_back(part_length):
     parts = split(IMAGE, transaction=3, table="thumbnail", part_length=part_length)
     assert received(through_packets(parts)) == [LargeData(3, 6, IMAGE)]
@@ -164,7 +164,7 @@ def test_a_number_begins_again_transfers_are_bounded_and_impossible_parts_are_re
         name, values = split(IMAGE, transaction=transaction, table=1, part_length=1000)[0]
         receiver.accept(name, values)
         assert receiver._kept <= 5000
-    with pytest.raises(ValueRefused):
+    with raises(ValueRefused):
         split(IMAGE, transaction=1, table=1, part_length=0)
-    with pytest.raises(ValueRefused, match="at most 65535 parts"):
+    with raises(ValueRefused, match="at most 65535 parts"):
         split(bytes(70_000), transaction=1, table=1, part_length=1)

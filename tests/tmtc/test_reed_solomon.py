@@ -1,8 +1,10 @@
 import numpy as np
-import pytest
 import reedsolo
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from numpy import array_equal
+from numpy.random import default_rng
+from pytest import mark, raises
 
 from tmtc.errors import LinkFormatError
 from tmtc.link.reed_solomon import (
@@ -19,7 +21,7 @@ from tmtc.link.reed_solomon import (
 
 
 def frames_for(code, count=3, seed=0):
-    return np.random.default_rng(seed).integers(0, 256, (count, code.frame_length), dtype=np.uint8)
+    return default_rng(seed).integers(0, 256, (count, code.frame_length), dtype=np.uint8)
 
 
 def independent(errors):
@@ -36,10 +38,10 @@ def test_the_generator_polynomial_and_the_dual_basis_are_those_of_the_standard()
     to_dual, from_dual = dual_basis_tables()
     assert to_dual[:8].tobytes().hex().upper() == "007BAFD499E2364D"
     assert [int(to_dual[1 << bit]) for bit in range(8)] == [0x7B, 0xAF, 0x99, 0xFA, 0x86, 0xEC, 0xEF, 0x8D]
-    assert np.array_equal(from_dual[to_dual], np.arange(256))
+    assert array_equal(from_dual[to_dual], np.arange(256))
 
 
-@pytest.mark.parametrize("errors", [8, 16])
+@mark.parametrize("errors", [8, 16])
 def test_conventional_codewords_are_those_of_an_independent_encoder(errors):
     code = ReedSolomon(errors=errors, interleave=1, dual_basis=False)
     frame = frames_for(code, 1)
@@ -51,7 +53,7 @@ def test_dual_codewords_interleaving_and_virtual_fill_are_symbol_by_symbol_those
     to_dual, from_dual = dual_basis_tables()
     dual, conventional = ReedSolomon(interleave=1), ReedSolomon(interleave=1, dual_basis=False)
     frames = frames_for(dual)
-    assert np.array_equal(encode(frames, dual), to_dual[encode(from_dual[frames], conventional)])
+    assert array_equal(encode(frames, dual), to_dual[encode(from_dual[frames], conventional)])
     code, single = ReedSolomon(interleave=5), ReedSolomon(interleave=1)
     blocks = encode(frames_for(code), code)
     for k in range(5):
@@ -59,10 +61,10 @@ def test_dual_codewords_interleaving_and_virtual_fill_are_symbol_by_symbol_those
     short, full = ReedSolomon(interleave=1, virtual_fill=23), ReedSolomon(interleave=1)
     frames = frames_for(short)
     padded = np.pad(frames, ((0, 0), (23, 0)))
-    assert np.array_equal(encode(frames, short), encode(padded, full)[:, 23:])
+    assert array_equal(encode(frames, short), encode(padded, full)[:, 23:])
 
 
-@pytest.mark.parametrize("row", ["1115 5 1275", "892 4 1020", "223 1 255", "446 2 510", "1784 8 2040", "1000 5 1160"])
+@mark.parametrize("row", ["1115 5 1275", "892 4 1020", "223 1 255", "446 2 510", "1784 8 2040", "1000 5 1160"])
 def test_the_code_is_found_from_the_frame_length(row):
     frame_length, interleave, block_length = map(int, row.split())
     code = code_for(frame_length)
@@ -75,13 +77,13 @@ def test_frames_that_no_code_carries_are_refused():
         (lambda: ReedSolomon(interleave=6), "expected interleave 1, 2, 3, 4, 5 or 8, found 6"),
         (lambda: encode(np.zeros((1, 10), dtype=np.uint8), ReedSolomon()), "expected frames of 1115 octets"),
     ):  # fmt: skip
-        with pytest.raises(LinkFormatError, match=message):
+        with raises(LinkFormatError, match=message):
             refused()
 
 
-@pytest.mark.parametrize("code", [ReedSolomon(), ReedSolomon(8, 2, 5), ReedSolomon(16, 1, 40, False)], ids=str)
+@mark.parametrize("code", [ReedSolomon(), ReedSolomon(8, 2, 5), ReedSolomon(16, 1, 40, False)], ids=str)
 def test_as_many_wrong_symbols_as_promised_are_repaired_and_counted_in_each_codeword(code):
-    rng = np.random.default_rng(1)
+    rng = default_rng(1)
     frames = frames_for(code, code.errors + 2)
     blocks = encode(frames, code)
     words = blocks.reshape(frames.shape[0], -1, code.interleave)
@@ -92,17 +94,15 @@ def test_as_many_wrong_symbols_as_promised_are_repaired_and_counted_in_each_code
     expected = [*range(code.errors + 1), UNCORRECTABLE]
     assert result.corrected[:, 0].tolist() == expected
     assert not result.corrected[:, 1:].any()
-    assert np.array_equal(result.frames[:-1], frames[:-1])
+    assert array_equal(result.frames[:-1], frames[:-1])
 
 
 def test_one_lost_codeword_does_not_hide_the_others():
     code = ReedSolomon()
-    frames = frames_for(code, 1)
-    blocks = encode(frames, code)
+    blocks = encode(frames_for(code, 1), code)
     blocks[0, 2 : 2 + 17 * 5 : 5] ^= 0x55  # seventeen errors in codeword 2
     blocks[0, 4] ^= 1  # one in codeword 4
-    result = decode(blocks, code)
-    assert result.corrected.tolist() == [[0, 0, UNCORRECTABLE, 0, 1]]
+    assert decode(blocks, code).corrected.tolist() == [[0, 0, UNCORRECTABLE, 0, 1]]
 
 
 def test_errors_found_in_the_virtual_fill_mean_that_too_many_others_were_there():
@@ -111,14 +111,14 @@ def test_errors_found_in_the_virtual_fill_mean_that_too_many_others_were_there()
     word = encode(frames_for(full, 1), full)[:, 10:]
     data, corrected = repair(word, code)
     assert corrected.tolist() == [UNCORRECTABLE]
-    assert np.array_equal(data, word)
+    assert array_equal(data, word)
 
 
-@pytest.mark.parametrize("errors", [8, 16])
+@mark.parametrize("errors", [8, 16])
 def test_repair_agrees_with_an_independent_decoder_up_to_and_beyond_its_power(errors):
     theirs = independent(errors)
     code = ReedSolomon(errors=errors, interleave=1, dual_basis=False)
-    rng = np.random.default_rng(errors)
+    rng = default_rng(errors)
     frames = frames_for(code, 60)
     words = encode(frames, code)
     for n in range(60):
@@ -132,11 +132,11 @@ def test_repair_agrees_with_an_independent_decoder_up_to_and_beyond_its_power(er
             assert corrected[n] == UNCORRECTABLE
             continue
         assert bytes(message) == data[n, : 255 - 2 * errors].tobytes() and len(positions) == corrected[n]
-    assert np.array_equal(data[corrected >= 0, : 255 - 2 * errors], frames[corrected >= 0])
+    assert array_equal(data[corrected >= 0, : 255 - 2 * errors], frames[corrected >= 0])
 
 
 def test_noise_is_uncorrectable_and_no_blocks_are_no_frames():
-    noise = np.random.default_rng(8).integers(0, 256, (300, 255), dtype=np.uint8)
+    noise = default_rng(8).integers(0, 256, (300, 255), dtype=np.uint8)
     # by the count of codewords within reach, 1 word of noise in 16! = 2e13 decodes with E = 16
     assert (repair(noise, ReedSolomon(interleave=1))[1] == UNCORRECTABLE).all()
     code = ReedSolomon()
@@ -158,4 +158,4 @@ def test_every_setting_encodes_to_clean_codewords_that_a_flipped_bit_spoils(erro
     blocks[1, at] ^= 1 << (seed % 8)
     assert clean(blocks, code).sum() == 2 * depth - 1
     result = decode(blocks, code)
-    assert np.array_equal(result.frames, frames) and result.corrected.sum() == 1
+    assert array_equal(result.frames, frames) and result.corrected.sum() == 1

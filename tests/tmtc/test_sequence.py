@@ -1,7 +1,7 @@
 import numpy as np
-import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from pytest import mark
 
 from tmtc.packets.sequence import CONFLICT, DUPLICATE, FIRST, account
 
@@ -62,8 +62,7 @@ def test_a_burst_from_yesterday_in_the_middle_of_today_is_separated():
     day = 86_400 << 16
     today, yesterday = np.arange(9000, 9100), np.arange(8900, 9000)
     counts = np.concatenate((today[:50], yesterday, today[50:]))
-    ticks = (counts << 16) + np.where(counts < 9000, day, 2 * day)
-    result = report(counts, ticks)
+    result = report(counts, (counts << 16) + np.where(counts < 9000, day, 2 * day))
     assert (result.gaps, result.duplicates) == (0, 0)
 
 
@@ -81,8 +80,7 @@ def test_senders_and_boots_are_accounted_apart():
     result = report(counts, apid=apid)
     assert result.gaps == 0 and [a.received for a in result.accounts] == [50, 50]
     counts = np.r_[:100, :100]
-    boot = np.repeat([7, 8], 100)
-    result = report(counts, boot=boot, same=never_same)
+    result = report(counts, boot=np.repeat([7, 8], 100), same=never_same)
     assert [(a.boot, a.received, a.gaps, a.conflicts) for a in result.accounts] == [(7, 100, 0, 0), (8, 100, 0, 0)]
 
 
@@ -99,7 +97,7 @@ def test_a_counter_that_begins_again_is_a_restart_without_hiding_losses():
         assert result.accounts[0].restarts == restarts, (before, after)
 
 
-@pytest.mark.parametrize(
+@mark.parametrize(
     "counts, restarts, conflicts, missing",
     [
         ([*range(25), *range(3, 30)], 1, 0, 0),  # the last five before and the first three after it are lost

@@ -3,9 +3,10 @@
 from itertools import accumulate
 
 import numpy as np
-import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from numpy.random import default_rng
+from pytest import mark
 
 from tests.tmtc.test_downlink import make_packets
 from tmtc.dictionary.payload import DICTIONARY
@@ -45,8 +46,7 @@ def test_a_stream_gives_all_its_packets_in_order_also_with_stray_octets():
     assert (cut.crc_errors, cut.octets_skipped, cut.octets_idle) == (0, 0, 0)
     cut = cut_packets(b"")
     assert len(cut) == 0 and cut.consumed == 0
-    octets = inserted(b"\x01\x02\x03")
-    cut = cut_to(octets, PACKETS)
+    cut = cut_to(inserted(b"\x01\x02\x03"), PACKETS)
     assert cut.skipped.tolist() == [[AT_500, AT_500 + 3]]
     assert cut.crc_errors == 0
 
@@ -54,12 +54,9 @@ def test_a_stream_gives_all_its_packets_in_order_also_with_stray_octets():
 # the injuries that other decoders were measured with: 3 stray octets, a flipped bit, a wrong length, a cut end
 
 
-@pytest.mark.parametrize(
-    "stray", [b"\x08\xa1\xc0", b"\x00" * 40, b"\xff" * 40, WHOLE[3:17], b"\x07\xff\xc0\x00\x00\x09"]
-)
+@mark.parametrize("stray", [b"\x08\xa1\xc0", b"\x00" * 40, b"\xff" * 40, WHOLE[3:17], b"\x07\xff\xc0\x00\x00\x09"])
 def test_stray_octets_that_look_like_headers_cost_no_packet(stray):
-    octets = inserted(stray)
-    cut = cut_to(octets, PACKETS)
+    cut = cut_to(inserted(stray), PACKETS)
     assert cut.octets_skipped + cut.lengths[~cut.crc_ok].sum() + cut.octets_idle == len(stray)
 
 
@@ -71,7 +68,7 @@ def test_a_flipped_bit_in_a_body_is_one_checksum_error_and_nothing_else():
     assert cut.lengths[~cut.crc_ok].tolist() == [len(PACKETS[500])]
 
 
-@pytest.mark.parametrize("change", [9, -9, 1, 255, 5000, 40_000, SWALLOWED])
+@mark.parametrize("change", [9, -9, 1, 255, 5000, 40_000, SWALLOWED])
 def test_a_wrong_length_field_costs_the_one_packet(change):
     octets, field = bytearray(WHOLE), slice(AT_500 + 4, AT_500 + 6)
     octets[field] = ((int.from_bytes(octets[field], "big") + change) % 65536).to_bytes(2, "big")
@@ -108,9 +105,7 @@ def test_a_damaged_packet_that_holds_a_whole_packet_does_not_give_birth_to_it():
     )
     damaged = bytearray(outer)
     damaged[-5] ^= 1
-    octets = inserted(bytes(damaged))
-    cut = cut_to(octets, PACKETS)
-    assert cut.crc_errors == 1
+    assert cut_to(inserted(bytes(damaged)), PACKETS).crc_errors == 1
 
 
 def test_idle_packets_are_counted_and_not_given_and_those_of_the_other_type_are_none():
@@ -128,7 +123,7 @@ def test_idle_packets_are_counted_and_not_given_and_those_of_the_other_type_are_
 
 def test_noise_and_endless_headers_give_no_packets_and_hide_none():
     # 4 MB of noise hold some 500,000 places where a header could stand, eight of which a bare CRC would believe
-    noise = np.random.default_rng(11).integers(0, 256, 4 << 20, dtype=np.uint8)
+    noise = default_rng(11).integers(0, 256, 4 << 20, dtype=np.uint8)
     cut = cut_packets(noise)
     assert int(cut.crc_ok.sum()) == 0
     assert cut.octets_skipped + cut.lengths.sum() == noise.size
@@ -137,7 +132,7 @@ def test_noise_and_endless_headers_give_no_packets_and_hide_none():
     cut = cut_packets(octets)
     assert not cut.crc_ok.any()
     assert_every_octet_is_accounted_for(octets, cut)
-    rng = np.random.default_rng(12)
+    rng = default_rng(12)
     parts = []
     for packet in PACKETS[:200]:
         parts += [rng.integers(0, 256, int(rng.integers(0, 3000)), dtype=np.uint8).tobytes(), packet]
@@ -149,8 +144,7 @@ def test_segments_are_cut_each_for_itself_and_the_longest_packet_is_one():
     half = len(PACKETS[500]) // 2
     octets = WHOLE[: AT_500 + half] + WHOLE[AT_500 + half :]
     segments = np.array([[0, AT_500 + half], [AT_500 + half, len(octets)]], dtype=np.int64)
-    cut = cut_to(octets, PACKETS[:500] + PACKETS[501:], segments=segments)
-    assert cut.octets_skipped == len(PACKETS[500])
+    assert cut_to(octets, PACKETS[:500] + PACKETS[501:], segments=segments).octets_skipped == len(PACKETS[500])
     packet = append_crc(pack_packet(5, bytes(65_536), sequence_count=0)[:-2])
     assert len(packet) == 65_542
     cut_to(packet + packet, [packet, packet])
@@ -190,8 +184,7 @@ def injure(octets, injuries):
 @given(st.lists(INJURIES, max_size=6))
 def test_whatever_happens_no_whole_packet_is_lost_and_none_is_invented(injuries):
     packets = PACKETS[:40]
-    original = b"".join(packets)
-    octets, marks = injure(original, injuries)
+    octets, marks = injure(b"".join(packets), injuries)
     safe, at = [], 0
     for packet in packets:
         stop = at + len(packet)
@@ -208,10 +201,10 @@ def test_whatever_happens_no_whole_packet_is_lost_and_none_is_invented(injuries)
     assert_every_octet_is_accounted_for(octets, cut)
 
 
-@pytest.mark.parametrize("cases", [1_000, 100_000])
+@mark.parametrize("cases", [1_000, 100_000])
 def test_injured_streams_lose_no_whole_packet_and_invent_none(cases):
     # each case is a segment of its own: two to five packets, of which one to three octets are hit by chance
-    rng = np.random.default_rng(2029)
+    rng = default_rng(2029)
     kinds = [
         DICTIONARY.pack("connection_report", {}, ticks=1, sequence_count=0),
         DICTIONARY.pack("verification_started", {"request_id": 77}, ticks=1, sequence_count=0),
@@ -251,8 +244,7 @@ def test_injured_streams_lose_no_whole_packet_and_invent_none(cases):
     good = set(zip(cut.offsets[cut.crc_ok].tolist(), cut.lengths[cut.crc_ok].tolist(), strict=True))
     assert set(expected) <= good
     # a damaged packet passes for a whole one at the checksum's own odds: some 200,000 of them, one in 65,536
-    invented = [at for at, length in good if bytes(buffer[at : at + length]) not in kinds]
-    assert len(invented) <= 10
+    assert len([at for at, length in good if bytes(buffer[at : at + length]) not in kinds]) <= 10
     assert int(cut.lengths.sum()) + cut.octets_skipped + cut.octets_idle == len(buffer)
 
 

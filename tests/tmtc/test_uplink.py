@@ -1,6 +1,6 @@
-import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from pytest import mark, raises
 
 from tmtc.dictionary.payload import DICTIONARY
 from tmtc.errors import ChecksumError, FrameError, TruncatedPacket, ValueRefused
@@ -35,8 +35,7 @@ LONG = DICTIONARY.pack_command(
 def test_code_blocks_cltus_and_frames_are_those_of_the_standard():
     # a code block seen on other links: 22F600FF00421A with parity octet 12
     assert bch_parity(bytes.fromhex("22F600FF00421A")) == 0x12
-    cltu = encode_cltu(bytes.fromhex("22F600FF00421A"))
-    assert cltu == CLTU_START + bytes.fromhex("22F600FF00421A12") + CLTU_TAIL
+    assert encode_cltu(bytes.fromhex("22F600FF00421A")) == CLTU_START + bytes.fromhex("22F600FF00421A12") + CLTU_TAIL
     # the last block is filled with 55
     assert encode_cltu(b"\x01")[2:9] == b"\x01" + b"\x55" * 6
     # version 00, bypass 1, control 0, spare 00, spacecraft 76 | channel 2, length 9 - 1 | number 5
@@ -51,15 +50,15 @@ def test_damaged_frames_are_refused_each_for_its_reason():
         (frame[:-1] + bytes((frame[-1] ^ 1,)), ChecksumError, None), (frame[:-1], TruncatedPacket, None),
         (b"\xff" * 12, FrameError, None), (bytes(12), FrameError, "8 octets or more"),
     ):  # fmt: skip
-        with pytest.raises(error, match=message):
+        with raises(error, match=message):
             unpack_tc_frame(octets)
-    with pytest.raises(ValueRefused, match=r"1\.\.1017"):
+    with raises(ValueRefused, match=r"1\.\.1017"):
         pack_tc_frame(TcFrame(76, 2, 5, bytes(1018)))
     assert len(pack_tc_frame(TcFrame(76, 2, 5, bytes(1017)))) == 1024
 
 
-@pytest.mark.parametrize("randomised", [True, False])
-@pytest.mark.parametrize("bypass", [True, False])
+@mark.parametrize("randomised", [True, False])
+@mark.parametrize("bypass", [True, False])
 def test_what_is_sent_comes_back_long_packets_too(randomised, bypass):
     octets = UplinkEncoder(76, randomised=randomised, bypass=bypass).encode([*COMMANDS, LONG])
     decoded = UplinkDecoder(76, randomised=randomised).decode(octets)
@@ -103,8 +102,7 @@ def test_sequence_controlled_frames_are_used_once_and_in_order():
 
 def test_a_number_far_off_locks_the_receiver_until_it_is_unlocked():
     decoder = UplinkDecoder(76)
-    encoder = UplinkEncoder(76, bypass=False, sequence_number=100)
-    far = encoder.encode(FIRST)
+    far = UplinkEncoder(76, bypass=False, sequence_number=100).encode(FIRST)
     assert decoder.decode(far).packets == ()
     assert decoder.farms[0].clcw.lockout
     assert decoder.decode(UplinkEncoder(76, bypass=False).encode(FIRST)).packets == ()
@@ -133,8 +131,7 @@ def test_packets_without_their_first_or_last_segment_are_dropped():
 
 
 def test_packets_are_cut_where_they_say_and_expedited_and_control_frames_counted():
-    segment = b"\xc0" + COMMANDS[0] + COMMANDS[1] + b"\x18\xa0"
-    frame = pack_tc_frame(TcFrame(76, 0, 0, segment, bypass=True))
+    frame = pack_tc_frame(TcFrame(76, 0, 0, b"\xc0" + COMMANDS[0] + COMMANDS[1] + b"\x18\xa0", bypass=True))
     decoded = UplinkDecoder(76, randomised=False).decode(encode_cltu(frame))
     assert list(decoded.packets) == COMMANDS[:2]
     assert decoded.faults == ("segment: expected a packet, found 2 octets",)
@@ -167,11 +164,10 @@ def test_whatever_the_link_does_no_command_is_invented(flips, cuts):
 @settings(max_examples=60, deadline=None)
 @given(st.binary(max_size=200))
 def test_any_octets_at_all_are_survived(octets):
-    decoded = UplinkDecoder(76).decode(octets + CLTU_START + octets)
-    assert decoded.octets_skipped <= 2 * len(octets) + 2
+    assert UplinkDecoder(76).decode(octets + CLTU_START + octets).octets_skipped <= 2 * len(octets) + 2
 
 
-@pytest.mark.parametrize(
+@mark.parametrize(
     "data", [b"", b"\x01", b"\x00\x00", CONTROL_SET_COUNT, CONTROL_SET_COUNT + b"\x01\x02", b"\x82\x01\x05"]
 )
 def test_an_invalid_control_command_is_not_counted(data):

@@ -244,8 +244,8 @@ def doubted_stations(
     The reports of a station are split into runs as those of the clock. Two runs disagree if every change between them
     shows it: a clock that was set changes for all stations. Of runs that disagree, those count that more stations
     share, or that alone agree with the on-board clock where the others are off by seconds of a usual cause; otherwise
-    neither. A single station counts as little if it differs
-    from the on-board clock by whole seconds with a usual cause, from its first report on.
+    neither. A single station counts as little if it differs from the on-board clock by whole seconds with a usual
+    cause, from its first report on.
     """
     sent = np.asarray(timescales.tai_ns_from_utc_ns(np.asarray(earth_utc_ns, dtype=np.int64))) - light_time_ns
     whole, part = np.divmod(np.asarray(ticks, dtype=np.int64), timescales.TICKS_PER_SECOND)

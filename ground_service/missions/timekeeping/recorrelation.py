@@ -110,7 +110,7 @@ def received_reports(given: Sequence[Mapping[str, Any]]) -> list[ReceivedReport]
     return reports
 
 
-def read_receptions(path: Path) -> list[ReceivedReport]:
+def read_receptions(path: Path, least: int = 1) -> list[ReceivedReport]:
     """Receptions out of a CSV file with the columns packet_ticks, sequence_count, received_utc and maybe station.
 
     Raises
@@ -128,9 +128,9 @@ def read_receptions(path: Path) -> list[ReceivedReport]:
     for name in ("packet_ticks", "sequence_count", "received_utc"):
         if name not in names:
             raise InvalidInput(str(path), "line 1", f"a column {name}", ",".join(names)[:120] or "nothing")
-    if not 0 < len(rows) <= RECEPTIONS_LIMIT:
+    if not least <= len(rows) <= RECEPTIONS_LIMIT:
         found = "more" if rows else "none"
-        raise InvalidInput(str(path), "", f"1 to {RECEPTIONS_LIMIT} receptions", found)
+        raise InvalidInput(str(path), "", f"{least} to {RECEPTIONS_LIMIT} receptions", found)
     given = [{**row, "received": row["received_utc"]} for row in rows]
     try:
         return received_reports(given)

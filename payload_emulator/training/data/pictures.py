@@ -29,8 +29,6 @@ from payload_emulator.session.world.external import IMAGE_SUFFIXES, read_picture
 
 _EQUAL_PX = 0.5
 """Labels whose boxes differ by less are one: tools round what they write."""
-_LOOSE_PX = 4.0
-"""Difference of a box from its polygons, which are simplified, that is allowed for small ones."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -273,7 +271,7 @@ def _label(item: Mapping[str, Any], place: str) -> _Label:
     if isinstance(polygons, list) and polygons:
         box, u, v, diameter = _of_polygons(polygons, place)
         stated = _box(item["bbox"], place) if item.get("bbox") else box
-        if max(map(abs, np.subtract(stated, box))) > max(_LOOSE_PX, 0.5 * max(box[2:])):
+        if max(map(abs, np.subtract(stated, box))) > max(*stated[2:], *box[2:]):
             raise DatasetError(
                 f"{place}: expected a box about the polygons, {np.round(box, 2).tolist()}, found {item['bbox']}"
             )

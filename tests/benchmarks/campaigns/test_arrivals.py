@@ -9,7 +9,7 @@ OTHER = "2029-08-08T02:00:00.000000Z"
 
 def report(packets=900, errors=(98.0, 95.0), state="processed"):
     passes = [
-        {"start": start, "median_error_m": error, "verdict_level": "met"}
+        {"start": start, "median_error_m": error, "map_offset_m": error, "verdict_level": "met"}
         for start, error in zip((START, OTHER), errors, strict=True)
     ]
     return {
@@ -31,6 +31,7 @@ def outcomes(disturbed, **given):
 def test_figures_are_flagged_by_events_of_their_pass_and_packets_kept_apart_and_others_different():
     assert outcomes(report(errors=(98.0, 95.001))) == {}
     assert outcomes(report(errors=(98.0, 96.0), packets=901)) == {
+        f"performance.passes[{OTHER}].map_offset_m": "DIFFERENT",
         f"performance.passes[{OTHER}].median_error_m": "DIFFERENT",
         "navigation.anchored.median_m": "DIFFERENT",
         "packets": "DIFFERENT",
@@ -56,4 +57,6 @@ def test_behind_a_pass_of_one_run_only_small_differences_are_flagged():
         disturbed = report(errors=(98.0, error))
         disturbed["performance"]["passes"][0]["start"] = "2029-08-07T03:00:00.000000Z"
         causes = {parse_utc("2029-08-06T20:00:00Z"): "clock step"}
-        assert outcomes(disturbed, causes=causes)[f"performance.passes[{OTHER}].median_error_m"] == outcome
+        found = outcomes(disturbed, causes=causes)
+        assert found[f"performance.passes[{OTHER}].median_error_m"] == outcome
+        assert found[f"performance.passes[{OTHER}].map_offset_m"] == "flagged"  # what the payload learns itself

@@ -3,14 +3,14 @@
 import json
 import subprocess
 
-import pytest
+from pytest import fixture, mark
 
 from benchmarks.campaigns import compatibility
 from benchmarks.campaigns.compatibility import ROWS, compare, format_page, result, versions
 
 
-@pytest.mark.parametrize(
-    ("found", "text"),
+@mark.parametrize(
+    "found, text",
     [
         ([[1.0, 1000.0], [2.0, 2000.0]], "equal (4 values)"),
         ([[1.0, 1000.0], [2.0, 2000.0 + 2e-5]], "equal to 8 digits (4 values)"),
@@ -33,7 +33,7 @@ def test_values_are_compared_by_name_and_a_quaternion_and_its_negative_are_the_s
     assert found == ("differs in 1 of 4 values: [0].a is 2, expected 1", False)
 
 
-@pytest.fixture
+@fixture
 def samples(tmp_path, monkeypatch):
     """Samples in a folder of their own."""
     monkeypatch.setattr(compatibility, "BUILD", tmp_path)

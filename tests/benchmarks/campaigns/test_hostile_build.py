@@ -4,12 +4,12 @@ import os
 import subprocess
 import sys
 
-import pytest
+from pytest import mark, param
 
 from benchmarks.campaigns.hostile.attack_kinds import KINDS
 from benchmarks.campaigns.hostile_build import _left, campaign, went_well
 
-root_only = pytest.mark.skipif(os.geteuid() != 0, reason="the profile can be taken by root only")
+root_only = mark.skipif(os.geteuid() != 0, reason="the profile can be taken by root only")
 
 
 def held(result):
@@ -18,7 +18,7 @@ def held(result):
     return went_well(result)
 
 
-@pytest.mark.parametrize("kinds", [("explore", "daemon"), pytest.param(KINDS, marks=pytest.mark.campaign)])
+@mark.parametrize("kinds", [("explore", "daemon"), param(KINDS, marks=mark.campaign)])
 def test_a_hostile_build_achieves_nothing_as_the_user_of_the_tests(kinds):
     result = campaign("user", kinds)
     assert held(result)
@@ -36,7 +36,7 @@ def test_a_process_that_remains_is_of_the_kind_that_left_it(tmp_path):
 
 
 @root_only
-@pytest.mark.campaign
+@mark.campaign
 def test_a_hostile_build_achieves_nothing_with_the_profile_of_the_image():
     assert held(campaign("image", ("explore", "daemon")))
 
@@ -50,7 +50,7 @@ def test_a_hostile_build_is_refused_where_the_engine_refuses_namespaces():
 
 
 @root_only
-@pytest.mark.parametrize("kinds", [("explore", "daemon"), pytest.param(KINDS, marks=pytest.mark.campaign)])
+@mark.parametrize("kinds", [("explore", "daemon"), param(KINDS, marks=mark.campaign)])
 def test_a_hostile_build_achieves_nothing_in_the_runner(kinds):
     result = campaign("no unshare, runner", kinds)
     assert held(result) and result.isolation.startswith("runner, bubblewrap")

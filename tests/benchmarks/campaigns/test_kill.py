@@ -6,7 +6,7 @@ import sys
 from dataclasses import replace
 
 import httpx
-import pytest
+from pytest import mark
 
 from benchmarks.campaigns._clients import Session, cut_pieces
 from benchmarks.campaigns._ledger import FAULTS, AuditLine, Decision, Entered, HandOut, Ledger, judge
@@ -17,11 +17,10 @@ SHORT = "--laptop --packets 400 --pieces 4 --reports 0 --pause 0.3 --json"
 
 def campaign(monkeypatch, capsys, words):
     monkeypatch.setattr(sys, "argv", ["kill", *words.split()])
-    code = main()
-    return code, json.loads(capsys.readouterr().out)
+    return main(), json.loads(capsys.readouterr().out)
 
 
-@pytest.mark.campaign
+@mark.campaign
 def test_nothing_is_lost_or_doubled_by_kills_and_a_campaign_goes_on_where_it_ended(monkeypatch, capsys, tmp_path):
     state = tmp_path / "state.json"
     code, figures = campaign(monkeypatch, capsys, f"{SHORT} --kills 3 --state {state}")
@@ -59,15 +58,13 @@ ROWS = [
 ]
 for row in ROWS:
     row.update(vehicle_id=1, requested_by="ann", arguments={"argument_1": 10.0 + row["id"]})
-LINES = [
-    *(AuditLine("enter", number, "ann") for number in (1, 2, 3, 4)), AuditLine("release", 1, "ann"),
-    AuditLine("send", 1, "bob"), AuditLine("reject", 2, "bob"), AuditLine("release", 3, "bob"),
-]  # fmt: skip
+ENTRIES = "enter 1 ann,enter 2 ann,enter 3 ann,enter 4 ann,release 1 ann,send 1 bob,reject 2 bob,release 3 bob"
+LINES = [AuditLine(kind, int(number), actor) for kind, number, actor in map(str.split, ENTRIES.split(","))]
 
 
 def record_of_clients():
     return Ledger(
-        entered=[Entered(11, 1, "ann"), Entered(12, 2, "ann"), Entered(13, 3, "ann")],
+        entered=[Entered(10 + k, k, "ann") for k in (1, 2, 3)],
         decisions=[
             Decision(1, "released", "ann"),
             Decision(2, "rejected", "bob"),
@@ -86,8 +83,8 @@ def changed(number, **values):
     return [{**row, **values} if row["id"] == number else row for row in ROWS]
 
 
-@pytest.mark.parametrize(
-    ("fault", "rows"),
+@mark.parametrize(
+    "fault, rows",
     [
         ("commands_lost", ROWS[1:]), ("commands_lost", changed(2, arguments={"argument_1": 99.0})),
         ("commands_doubled", [*ROWS, {**ROWS[3], "id": 5}]), ("states_lost", changed(3, state="queued")),
@@ -117,8 +114,7 @@ def test_a_second_hand_out_and_a_changed_answer_are_faults():
 def test_every_change_has_one_audit_entry_of_its_actor():
     record = record_of_clients()
     for number in range(len(LINES)):
-        missing = [line for k, line in enumerate(LINES) if k != number]
-        assert judge(record, ROWS, missing)["audit_wrong"] == 1
+        assert judge(record, ROWS, [line for k, line in enumerate(LINES) if k != number])["audit_wrong"] == 1
         assert judge(record, ROWS, [*LINES, LINES[number]])["audit_wrong"] == 1
         other = [replace(line, actor="eve") if k == number else line for k, line in enumerate(LINES)]
         assert judge(record, ROWS, other)["audit_wrong"] == (LINES[number].command != 4 or 1)

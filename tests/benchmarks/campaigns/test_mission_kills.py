@@ -7,6 +7,7 @@ import threading
 from pathlib import Path
 
 import pytest
+from pytest import approx, mark, raises
 
 from benchmarks._servers import PidFile, PostgresServer
 from benchmarks.campaigns._kills import PHASES, Keeper, Kill, PlannedKill, plan_kills
@@ -43,7 +44,7 @@ def hold_telecommands_until_the_spacecraft_was_killed(monkeypatch):
     monkeypatch.setattr(links, "unsent", lambda *given: unsent(*given) or int(not was_restarted.is_set()))
 
 
-@pytest.mark.campaign
+@mark.campaign
 def test_kills_do_not_change_the_figures_of_a_run(tmp_path, monkeypatch):
     monkeypatch.delenv("LINNA_DATA", raising=False)
     scenario, data = parse_scenario(SCENARIO), DataFolder(None)
@@ -58,7 +59,7 @@ def test_kills_do_not_change_the_figures_of_a_run(tmp_path, monkeypatch):
     assert killed["kills"]["by_part"] == {part: 1 for _, part, _ in sorted(KILLED, key=lambda one: one[1])}
     assert killed["kills"]["done"] == killed["kills"]["planned"] == len(KILLED)
     # A report uses the time correlation of that moment, which further time reports of the contact change a little.
-    assert figures_of(killed) == pytest.approx(figures_of(whole), rel=1e-5, abs=0.0, nan_ok=True)
+    assert figures_of(killed) == approx(figures_of(whole), rel=1e-5, abs=0.0, nan_ok=True)
     assert len(figures_of(whole)) > 50
     assert killed["windows"]["processed"] == killed["windows"]["flown"] > 0 and killed["interventions"] == 0
     assert killed["packets_received"] == killed["packets"] > 0 and killed["packets_lost"] == 0
@@ -191,10 +192,10 @@ def test_a_part_that_does_not_start_ends_the_run_with_one_line(tmp_path, monkeyp
     monkeypatch.setattr("studies.harness.parts.START_S", 0.5)
     part = Part([sys.executable, "-c", "raise SystemExit('no home')"], tmp_path / "log", lambda: False)
     keeper = made_keeper({"api": part}, (), tmp_path)
-    with pytest.raises(GroundError, match=r"expected it to start within .* found: no home"):
+    with raises(GroundError, match=r"expected it to start within .* found: no home"):
         part.start()
     keeper.start()
-    with pytest.raises(GroundError, match="supervision of its parts"):
+    with raises(GroundError, match="supervision of its parts"):
         while True:
             keeper.check()
 
@@ -202,7 +203,7 @@ def test_a_part_that_does_not_start_ends_the_run_with_one_line(tmp_path, monkeyp
 def test_a_part_that_ends_at_once_is_given_up_after_its_attempts(tmp_path):
     log = tmp_path / "log"
     part = Part([sys.executable, "-c", "print('no home')"], log, lambda: False, attempts=2)
-    with pytest.raises(GroundError, match=r"found: no home \| no home$"):
+    with raises(GroundError, match=r"found: no home \| no home$"):
         part.start()
     assert log.read_text() == "no home\n" * 2
 
@@ -227,8 +228,7 @@ def test_processes_that_a_killed_run_has_left_are_ended_and_no_others(tmp_path):
 
 def test_a_database_server_continues_with_its_files(tmp_path):
     first = PostgresServer(tmp_path)
-    url = first.prepare_service()
-    assert "//service@" in url
+    assert "//service@" in first.prepare_service()
     first.part.kill()
     again = PostgresServer(tmp_path)
     try:

@@ -302,7 +302,7 @@ def test_a_pdf_is_made_of_stored_octets_when_it_is_first_read(imported, tmp_path
 
 
 def test_a_report_is_made_in_process_without_http(imported, tmp_path, monkeypatch):
-    """What fails is asked again as an operation, which states the fault."""
+    """An operation states the fault of a request that fails in process."""
     ground, pass_id, _ = imported
     monkeypatch.setattr(pdf_pages, "pdf_of", lambda *_: b"%PDF-")
     with local_client(open_ground(ground.home), "ann") as client, monkeypatch.context() as patched:

@@ -384,7 +384,6 @@ def test_a_start_state_is_propagated_from_its_instant_with_a_perfect_one_if_it_i
     assert kepler.utc_ns.tolist() == TIMES[2:].tolist()
     assert_allclose(kepler.error_rtn_m, 0.0, atol=0.01)
     assert of_baselines(evaluated(start_state=StartState(int(TIMES[-1]) + SECOND, *state))) == []
-    position, velocity = circle(0.0)
     moved = position + np.array([0.0, 1.5, 0.0])
     exact, late = (of_baselines(evaluated(start_state=StartState(EPOCH + ns, moved, velocity))) for ns in (0, 12_000))
     assert [one.name for one in exact] == [one.name for one in late] == [*BASELINES]

@@ -7,11 +7,13 @@ import zipfile
 from dataclasses import replace
 
 import numpy as np
-import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from lxml import etree
+from numpy import cos, sin
+from numpy.random import default_rng
 from numpy.testing import assert_allclose, assert_array_equal
+from pytest import mark, raises
 from scipy.spatial.transform import Rotation
 
 from lunar.constants import NS
@@ -35,7 +37,7 @@ def rows_of(table):
 
 
 def ephemeris():
-    rng = np.random.default_rng(1)
+    rng = default_rng(1)
     matrix = rng.normal(size=(6, 6))
     covariances = [Covariance(START + k * 60 * NS, "RTN", (k + 1) * matrix @ matrix.T) for k in (0, 1)]
 
@@ -81,7 +83,7 @@ def test_oem_in_xml_is_read_as_it_was_written():
     assert_same(parse_oem_xml(format_oem_xml(ephemeris()).encode()), ephemeris())
 
 
-@pytest.mark.filterwarnings("ignore:ERFA function")
+@mark.filterwarnings("ignore:ERFA function")
 def test_another_reader_gives_the_same_states_from_xml(tmp_path):
     import oem as independent
 
@@ -96,7 +98,7 @@ def test_another_reader_gives_the_same_states_from_xml(tmp_path):
     assert_allclose(covariances[1].matrix, expected.segments[0].covariances[1].matrix / 1e6)
 
 
-@pytest.mark.filterwarnings("ignore:ERFA function")
+@mark.filterwarnings("ignore:ERFA function")
 def test_oem_of_another_writer_in_xml_is_read(tmp_path):
     import oem as independent
 
@@ -152,7 +154,7 @@ def test_faults_of_xml_are_named_with_their_line():
         ('<?xml version="1.0" encoding="big5"?><oem/>', "expected XML in UTF-8"),
     ):  # fmt: skip
         assert text != whole
-        with pytest.raises(DataFileError, match=message):
+        with raises(DataFileError, match=message):
             parse_oem_xml(text.encode(), "orbit.xml")
 
 
@@ -160,7 +162,7 @@ def test_an_error_in_a_state_names_the_line_of_the_xml():
     lines = format_oem_xml(ephemeris()).splitlines()
     where = next(k for k, line in enumerate(lines) if line.startswith("<stateVector>"))
     lines[where + 1] = lines[where + 1].replace("T00:01", "T00:61")
-    with pytest.raises(DataFileError, match=f"line {where + 2}: expected an epoch"):
+    with raises(DataFileError, match=f"line {where + 2}: expected an epoch"):
         parse_oem_xml("\n".join(lines).encode())
 
 
@@ -175,7 +177,7 @@ def zipped(*contents):
     return buffer.getvalue()
 
 
-@pytest.mark.parametrize("compress", [gzip.compress, zipped])
+@mark.parametrize("compress", [gzip.compress, zipped])
 def test_compressed_oem_is_read(tmp_path, compress):
     path = tmp_path / "orbit"
     for text in (format_oem(ephemeris()), format_oem_xml(ephemeris())):
@@ -189,7 +191,7 @@ def test_two_gzip_members_are_one_file(tmp_path):
     assert read_expanded(path, "text") == b"one two"
 
 
-@pytest.mark.parametrize(
+@mark.parametrize(
     "octets, message",
     [
         (gzip.compress(bytes(5 << 20)), "expected at most 1 MiB when expanded, found more"),
@@ -206,7 +208,7 @@ def test_two_gzip_members_are_one_file(tmp_path):
 def test_faults_of_compressed_files_are_named(tmp_path, octets, message):
     path = tmp_path / "orbit.gz"
     path.write_bytes(octets)
-    with pytest.raises(DataFileError, match=rf"orbit\.gz: {message}"):
+    with raises(DataFileError, match=rf"orbit\.gz: {message}"):
         read_expanded(path, "an ephemeris", 1 << 20)
 
 
@@ -216,9 +218,9 @@ def test_many_gzip_members_take_linear_time(tmp_path):
     assert read_expanded(path, "text") == b""
 
 
-@pytest.mark.parametrize("year", ["9999", "1500"])
+@mark.parametrize("year", ["9999", "1500"])
 def test_years_outside_64_bits_of_nanoseconds_are_refused(year):
-    with pytest.raises(TimeFormatError):
+    with raises(TimeFormatError):
         parse_utc(f"{year}-01-01T00:00:00Z")
 
 
@@ -226,7 +228,7 @@ def test_years_outside_64_bits_of_nanoseconds_are_refused(year):
 
 
 def attitudes(count=6):
-    q = np.random.default_rng(4).normal(size=(count, 4))
+    q = default_rng(4).normal(size=(count, 4))
     return AttitudeSegment(
         START + np.arange(count) * 15 * NS,
         continuous_quaternions(q / np.linalg.norm(q, axis=1, keepdims=True)),
@@ -241,8 +243,7 @@ def standard_matrix(q1, q2, q3, qc):
 
 
 def test_quaternions_of_an_aem_are_those_of_the_standard():
-    text = format_aem((attitudes(),))
-    rows = text.partition("DATA_START\n")[2].partition("\nDATA_STOP")[0].splitlines()
+    rows = format_aem((attitudes(),)).partition("DATA_START\n")[2].partition("\nDATA_STOP")[0].splitlines()
     for row, q_wxyz in zip(rows, attitudes().q_wxyz, strict=True):
         numbers = [float(token) for token in row.split()[1:]]
         assert_allclose(standard_matrix(*numbers), matrix_from_quaternion(q_wxyz), atol=1e-11)
@@ -273,7 +274,7 @@ def test_order_and_direction_of_quaternions_are_as_stated():
 
 def test_an_aem_is_written_as_version_2_or_in_the_old_form_with_continuous_signs():
     angle = np.linspace(0.0, 2.0 * np.pi, 6)
-    q_wxyz = np.stack([np.cos(angle), np.sin(angle), 0 * angle, 0 * angle], axis=1)
+    q_wxyz = np.stack([cos(angle), sin(angle), 0 * angle, 0 * angle], axis=1)
     flipped = AttitudeSegment(attitudes().utc_ns, q_wxyz * np.array([1, -1, -1, 1, -1, 1])[:, None])
     texts = {version: format_aem((flipped,), version) for version in ("1.0", "2.0")}
     assert format_aem((flipped,)) == texts["2.0"]
@@ -301,7 +302,7 @@ def test_an_aem_in_xml_is_read_by_its_elements_and_a_missing_scalar_is_named_wit
     (segment,) = parse_aem(AEM_XML)
     assert_array_equal(segment.utc_ns, START + np.array([0, 15]) * NS)
     assert_allclose(segment.q_wxyz, [[0.6, 0, -0.8, 0], [0, 0, 0, -1.0]], atol=1e-15)
-    with pytest.raises(DataFileError, match=r"line 8: expected <QC> with one value, found 'none'"):
+    with raises(DataFileError, match=r"line 8: expected <QC> with one value, found 'none'"):
         parse_aem(AEM_XML.replace("<QC>0.6</QC>", ""))
 
 
@@ -317,16 +318,16 @@ T00:00:15.000  | T00:00:15.000 9 | line 20: expected a quaternion of unit length
 """
 
 
-@pytest.mark.parametrize("old, new, message", rows_of(AEM_FAULTS))
+@mark.parametrize("old, new, message", rows_of(AEM_FAULTS))
 def test_faults_of_an_aem_are_named_with_their_line(old, new, message):
     text, old = format_aem((attitudes(),)), old.replace("¶", "\n")
     assert old in text
-    with pytest.raises(DataFileError, match=message):
+    with raises(DataFileError, match=message):
         parse_aem(text.replace(old, new))
 
 
 def test_an_empty_attitude_segment_is_refused():
-    with pytest.raises(EphemerisError, match="expected at least one attitude, found none"):
+    with raises(EphemerisError, match="expected at least one attitude, found none"):
         AttitudeSegment(np.zeros(0, dtype=np.int64), np.zeros((0, 4)))
 
 
@@ -359,8 +360,7 @@ def test_a_horizons_table_is_read(tmp_path):
     segment = load_ephemeris(path).segments[0]
     assert segment.object_name == "LRO"
     # TDB is 69.184 s ahead of UTC, but for the 1.7 ms of its periodic part.
-    offset = from_tai_ns(segment.tai_ns, "TDB") - (START + np.array([0, 60]) * NS)
-    assert np.abs(offset).max() <= 1
+    assert np.abs(from_tai_ns(segment.tai_ns, "TDB") - (START + np.array([0, 60]) * NS)).max() <= 1
     assert_allclose(segment.position_m[0], [1.768e6, 0.0, -15e3])
     assert_allclose(segment.velocity_m_s[1], [110.0, 1500.0, 210.0])
 
@@ -378,12 +378,12 @@ Calendar Date (TDB) | Date | columns: expected columns with Calendar Date \(TDB\
 """
 
 
-@pytest.mark.parametrize("old, new, message", rows_of(HORIZONS_FAULTS))
+@mark.parametrize("old, new, message", rows_of(HORIZONS_FAULTS))
 def test_faults_of_a_horizons_table_are_named(tmp_path, old, new, message):
     path = tmp_path / "lro.csv"
     assert old in HORIZONS
     path.write_text(HORIZONS.replace(old, new))
-    with pytest.raises(UnknownFrameError if "frame" in message else DataFileError, match=message):
+    with raises(UnknownFrameError if "frame" in message else DataFileError, match=message):
         load_ephemeris(path)
 
 
@@ -401,20 +401,20 @@ def test_a_horizons_table_with_steps_of_a_second_across_a_leap_second_is_read(tm
 def test_an_attitude_within_a_leap_second_is_refused_with_that_reason():
     for system, clock in (("UTC", "2016-12-31T23:59:60.000"), ("TT", "2017-01-01T00:01:08.184")):
         text = format_aem((attitudes(1),)).replace("TIME_SYSTEM = UTC", f"TIME_SYSTEM = {system}")
-        with pytest.raises(DataFileError, match=f"epoch outside of a leap second, .* found '{clock}' {system}"):
+        with raises(DataFileError, match=f"epoch outside of a leap second, .* found '{clock}' {system}"):
             parse_aem(text.replace("2029-08-07T00:00:00.000 ", f"{clock} "))
 
 
 def test_an_spk_is_referred_to_the_converter(tmp_path):
     path = tmp_path / "orbit.bsp"
     path.write_bytes(b"DAF/SPK " + bytes(100))
-    with pytest.raises(DataFileError, match="found a SPICE kernel; convert it with 'linna orbit convert'"):
+    with raises(DataFileError, match="found a SPICE kernel; convert it with 'linna orbit convert'"):
         load_ephemeris(path)
 
 
 ANGLE = np.arange(20)[:, None] * 0.3
-POSITION_M = 1_768_180.0 * np.concatenate([np.cos(ANGLE), 0.6 * np.sin(ANGLE), 0.8 * np.sin(ANGLE)], 1)
-VELOCITY_M_S = 1665.0 * np.concatenate([-np.sin(ANGLE), 0.6 * np.cos(ANGLE), 0.8 * np.cos(ANGLE)], 1)
+POSITION_M = 1_768_180.0 * np.concatenate([cos(ANGLE), 0.6 * sin(ANGLE), 0.8 * sin(ANGLE)], 1)
+VELOCITY_M_S = 1665.0 * np.concatenate([-sin(ANGLE), 0.6 * cos(ANGLE), 0.8 * cos(ANGLE)], 1)
 EPHEMERIS = ephemeris_from_states(START + np.arange(20) * 300 * NS + 1, POSITION_M, VELOCITY_M_S)
 
 
@@ -431,7 +431,7 @@ def test_tum_has_no_place_for_a_state_within_a_leap_second():
     (one,) = EPHEMERIS.segments
     moved = one.tai_ns - one.tai_ns[3] + parse_tai("2016-12-31T23:59:60.5")
     leap = replace(one, tai_ns=moved, utc_ns=utc_ns_from_tai_ns(moved))
-    with pytest.raises(EphemerisError, match=r"outside of leap seconds, found 2016-12-31T23:59:60\.500Z"):
+    with raises(EphemerisError, match=r"outside of leap seconds, found 2016-12-31T23:59:60\.500Z"):
         format_tum(Ephemeris((leap,)))
 
 

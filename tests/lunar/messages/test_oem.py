@@ -2,6 +2,8 @@
 
 import numpy as np
 import pytest
+from numpy import allclose, array_equal, cos, diag, sin
+from pytest import approx, raises
 
 from lunar.constants import NS
 from lunar.ephemeris import Covariance, Ephemeris, EphemerisSegment
@@ -98,8 +100,8 @@ META_STOP
 
 def example_ephemeris(n=50, covariances=()):
     angle = np.arange(n) * 30.0 * 2 * np.pi / 6672.0
-    position = 1_768_180.0 * np.stack([np.cos(angle), 0.6 * np.sin(angle), 0.8 * np.sin(angle)], -1)
-    velocity = 1665.0 * np.stack([-np.sin(angle), 0.6 * np.cos(angle), 0.8 * np.cos(angle)], -1)
+    position = 1_768_180.0 * np.stack([cos(angle), 0.6 * sin(angle), 0.8 * sin(angle)], -1)
+    velocity = 1665.0 * np.stack([-sin(angle), 0.6 * cos(angle), 0.8 * cos(angle)], -1)
     utc_ns = START + np.arange(n) * 30 * NS
     later = utc_ns + (n - 1) * 30 * NS
     first = EphemerisSegment(utc_ns, position, velocity, comments=("first", "of two"), covariances=covariances)
@@ -116,33 +118,31 @@ def test_version_1_is_read_with_units_frame_bias_comments_and_useable_interval()
     assert format_utc(ephemeris.start_utc_ns) == "2029-08-07T00:01:00.000Z"
     assert format_utc(ephemeris.stop_utc_ns) == "2029-08-07T00:03:00.000Z"
     assert len(segment.utc_ns) == 5
-    assert np.allclose(segment.position_m[1], icrf_from_j2000() @ [1765.2e3, 99.8e3, 16e3], atol=1e-6)
+    assert allclose(segment.position_m[1], icrf_from_j2000() @ [1765.2e3, 99.8e3, 16e3], atol=1e-6)
     # 23 mas: a fifth of a metre at this distance, and not to be lost.
     assert 0.1 < np.linalg.norm(segment.position_m[1] - [1765.2e3, 99.8e3, 16e3]) < 0.3
 
 
 def test_version_3_is_read_with_time_system_covariances_and_segments():
-    ephemeris = parse_oem(VERSION_3)
-    first, second = ephemeris.segments
+    first, second = parse_oem(VERSION_3).segments
     # TDB is ahead of UTC by 69.184 s; TDB - TT is some -0.9 ms in August.
     assert abs(int(first.utc_ns[0]) - START) < 2_000_000
     assert abs(int(first.utc_ns[0]) - START) > 100_000
     assert second.interpolation == "LAGRANGE"
     one, two = first.covariances
     assert (one.frame, two.frame) == ("RTN", "RTN")
-    assert one.matrix[2, 2] == pytest.approx(3.0)  # 3e-6 km2
-    assert one.matrix[4, 0] == one.matrix[0, 4] == pytest.approx(1e-4)
-    assert two.matrix[5, 5] == pytest.approx(4e-6)
-    assert np.array_equal(first.velocity_m_s[:, 1], [1665.0, 1662.0])
+    assert one.matrix[2, 2] == approx(3.0)  # 3e-6 km2
+    assert one.matrix[4, 0] == one.matrix[0, 4] == approx(1e-4)
+    assert two.matrix[5, 5] == approx(4e-6)
+    assert array_equal(first.velocity_m_s[:, 1], [1665.0, 1662.0])
 
 
 def test_what_is_written_is_read_back_to_a_micrometre_with_everything_else_the_same():
-    covariance = Covariance(START, "RTN", np.diag([1.0, 4.0, 9.0, 1e-6, 4e-6, 9e-6]))
-    ephemeris = example_ephemeris(covariances=(covariance,))
+    ephemeris = example_ephemeris(covariances=(Covariance(START, "RTN", diag([1.0, 4.0, 9.0, 1e-6, 4e-6, 9e-6])),))
     back = parse_oem(format_oem(ephemeris))
     assert_same(back, ephemeris)
     for was, now in zip(ephemeris.segments, back.segments, strict=True):
-        assert np.array_equal(was.utc_ns, now.utc_ns)
+        assert array_equal(was.utc_ns, now.utc_ns)
         assert was.useable_stop_utc_ns == now.useable_stop_utc_ns
     assert format_oem(back) == format_oem(parse_oem(format_oem(back)))
 
@@ -152,7 +152,7 @@ def test_every_time_system_keeps_the_epochs_to_the_nanosecond(system):
     utc_ns = START + np.array([0, 1, 123_456_789, 30 * NS])
     states = np.arange(12.0).reshape(4, 3) + 1.0
     ephemeris = Ephemeris((EphemerisSegment(utc_ns, states, states),))
-    assert np.array_equal(parse_oem(format_oem(ephemeris, time_system=system)).utc_ns, utc_ns)
+    assert array_equal(parse_oem(format_oem(ephemeris, time_system=system)).utc_ns, utc_ns)
 
 
 @pytest.mark.filterwarnings("ignore:.*dubious year:erfa.ErfaWarning")
@@ -161,7 +161,7 @@ def test_the_independent_reader_reads_what_we_write_and_interpolates_to_the_same
     from astropy.time import Time
 
     path = tmp_path / "ours.oem"
-    covariance = Covariance(START, "RTN", np.diag([1.0, 4.0, 9.0, 1e-6, 4e-6, 9e-6]))
+    covariance = Covariance(START, "RTN", diag([1.0, 4.0, 9.0, 1e-6, 4e-6, 9e-6]))
     ephemeris = example_ephemeris(covariances=(covariance,))
     save_oem(ephemeris, path)
     theirs = independent.OrbitEphemerisMessage.open(path)
@@ -175,17 +175,17 @@ def test_the_independent_reader_reads_what_we_write_and_interpolates_to_the_same
         for k in (0, 17, -1):
             state = states[k]
             assert state.epoch.isot == format_utc(int(ours.utc_ns[k]), 6).rstrip("Z")
-            assert np.allclose(1e3 * np.array(state.position), ours.position_m[k], atol=1e-6, rtol=0)
-            assert np.allclose(1e3 * np.array(state.velocity), ours.velocity_m_s[k], atol=1e-9, rtol=0)
+            assert allclose(1e3 * np.array(state.position), ours.position_m[k], atol=1e-6, rtol=0)
+            assert allclose(1e3 * np.array(state.velocity), ours.velocity_m_s[k], atol=1e-9, rtol=0)
     (block,) = theirs.segments[0].covariances
     assert block.frame == "RTN"
-    assert np.allclose(block.matrix * 1e6, covariance.matrix, rtol=1e-12)
+    assert allclose(block.matrix * 1e6, covariance.matrix, rtol=1e-12)
     for seconds in (100, 731, 1400):
         state = theirs(Time(format_utc(START + seconds * NS).rstrip("Z"), scale="utc"))
         # The writer's micrometre, and two interpolators' ways of dealing with rounding.
         position, velocity = ephemeris.at(START + seconds * NS)
-        assert np.allclose(1e3 * np.array(state.position), position, atol=1e-4, rtol=0)
-        assert np.allclose(1e3 * np.array(state.velocity), velocity, atol=1e-6, rtol=0)
+        assert allclose(1e3 * np.array(state.position), position, atol=1e-4, rtol=0)
+        assert allclose(1e3 * np.array(state.velocity), velocity, atol=1e-6, rtol=0)
 
 
 @pytest.mark.filterwarnings("ignore:.*dubious year:erfa.ErfaWarning")
@@ -197,9 +197,9 @@ def test_we_read_what_the_independent_writer_writes(tmp_path):
     save_oem(ephemeris, ours)
     independent.OrbitEphemerisMessage.open(ours).save_as(theirs)
     back = load_ephemeris(theirs)
-    assert np.array_equal(back.utc_ns, ephemeris.utc_ns)
+    assert array_equal(back.utc_ns, ephemeris.utc_ns)
     for was, now in zip(ephemeris.segments, back.segments, strict=True):
-        assert np.allclose(was.position_m, now.position_m, atol=1e-3, rtol=0)
+        assert allclose(was.position_m, now.position_m, atol=1e-3, rtol=0)
         assert (was.degree, was.useable_stop_utc_ns) == (now.degree, now.useable_stop_utc_ns)
 
 
@@ -259,7 +259,7 @@ TWICE = VERSION_1 + VERSION_1[VERSION_1.index("META_START") :]
 def test_a_faulty_file_is_refused_in_one_line_with_its_place(tmp_path, text, message):
     path = tmp_path / "faulty.oem"
     path.write_text(text)
-    with pytest.raises(DataFileError) as caught:
+    with raises(DataFileError) as caught:
         load_ephemeris(path)
     found = str(caught.value)
     assert found.startswith(str(path)) and message in found and "\n" not in found
@@ -268,13 +268,13 @@ def test_a_faulty_file_is_refused_in_one_line_with_its_place(tmp_path, text, mes
 def test_a_line_of_more_than_64_kib_is_refused_before_it_is_parsed(tmp_path):
     path = tmp_path / "long.oem"
     path.write_text(replaced("EME2000", "E" * (1 << 17)))
-    with pytest.raises(DataFileError, match=r"expected at most 65536 octets in a line, found more$"):
+    with raises(DataFileError, match=r"expected at most 65536 octets in a line, found more$"):
         load_ephemeris(path)
 
 
 def test_comments_between_states_are_passed():
     text = replaced("2029-08-07T00:03:00.000Z", "COMMENT CENTER_NAME = EARTH\n2029-08-07T00:03:00.000Z")
-    assert np.array_equal(parse_oem(text).segments[0].position_m, parse_oem(VERSION_1).segments[0].position_m)
+    assert array_equal(parse_oem(text).segments[0].position_m, parse_oem(VERSION_1).segments[0].position_m)
 
 
 def test_an_unknown_frame_and_an_unknown_time_system_are_refused_with_what_is_known(tmp_path):
@@ -284,7 +284,7 @@ def test_an_unknown_frame_and_an_unknown_time_system_are_refused_with_what_is_kn
         ("= UTC", "= LTC", UnknownTimeSystemError, "11: expected .*TDB"),
     ):
         path.write_text(replaced(old, new))
-        with pytest.raises(error, match=rf"faulty\.oem: line {message}.*, found '{new.strip('= ')}'"):
+        with raises(error, match=rf"faulty\.oem: line {message}.*, found '{new.strip('= ')}'"):
             load_ephemeris(path)
 
 
@@ -317,14 +317,13 @@ def test_epochs_within_a_leap_second_that_have_no_place_are_refused_with_that_re
     text = format_oem(over_the_leap_second(60)).replace(
         "STOP_TIME", "USEABLE_STOP_TIME = 2016-12-31T23:59:60.5\nSTOP_TIME"
     )
-    with pytest.raises(DataFileError, match="line 12: expected a UTC epoch outside of a leap second"):
+    with raises(DataFileError, match="line 12: expected a UTC epoch outside of a leap second"):
         parse_oem(text)
 
 
 @pytest.mark.parametrize("name", ["ICRS", "GCRF"])
 def test_other_names_of_icrf_axes_are_read(name):
-    found = parse_oem(VERSION_3.replace("REF_FRAME = ICRF", f"REF_FRAME = {name}", 1))
-    assert found.segments[0].frame == "ICRF"
+    assert parse_oem(VERSION_3.replace("REF_FRAME = ICRF", f"REF_FRAME = {name}", 1)).segments[0].frame == "ICRF"
 
 
 @pytest.mark.parametrize("fault", ["2029-13-07T00:00:00", "9noon"])
@@ -332,5 +331,5 @@ def test_an_epoch_that_is_none_among_a_thousand_is_named_with_its_line(fault):
     """Numpy ends the process by a segmentation fault where it refuses one of more than 500 texts."""
     lines = format_oem(over_the_leap_second(1)).splitlines()
     lines[-20] = fault + lines[-20][19:]
-    with pytest.raises(DataFileError, match=f"line {len(lines) - 19}: expected an epoch like .*, found '{fault}"):
+    with raises(DataFileError, match=f"line {len(lines) - 19}: expected an epoch like .*, found '{fault}"):
         parse_oem("\n".join(lines))

@@ -6,9 +6,10 @@ from contextlib import contextmanager
 from functools import partial
 
 import numpy as np
-import pytest
 import spiceypy
+from numpy.random import default_rng
 from numpy.testing import assert_allclose, assert_array_equal
+from pytest import approx, mark, raises
 
 from lunar.camera import PinholeCamera
 from lunar.constants import NS
@@ -69,14 +70,13 @@ def test_ephemeris_time_is_that_of_spice_also_within_a_leap_second(tmp_path):
     near(et_from_utc_ns(utc_ns), np.delete(expected, 2), atol=3e-7)
 
 
-@pytest.mark.parametrize("data_type", [3, 13])
-@pytest.mark.parametrize("interpolation, degree", [("HERMITE", 7), ("LAGRANGE", 9), ("LINEAR", 1)])
+@mark.parametrize("data_type", [3, 13])
+@mark.parametrize("interpolation, degree", [("HERMITE", 7), ("LAGRANGE", 9), ("LINEAR", 1)])
 def test_spk_gives_the_states_of_the_ephemeris(tmp_path, interpolation, degree, data_type):
     ephemeris = Ephemeris((arc(0, 7200, interpolation=interpolation, degree=degree),))
     asked = START + np.arange(0, 7200 * NS, 13 * NS + 7_000_001)
     position, velocity = ephemeris.at(asked)
-    kernel = spk_kernel(ephemeris, CRAFT, data_type)
-    with kernels(tmp_path, orbit=kernel.octets) as spice:
+    with kernels(tmp_path, orbit=spk_kernel(ephemeris, CRAFT, data_type).octets) as spice:
         states = 1e3 * np.array([spice.spkgeo(CRAFT, et, "J2000", 301)[0] for et in et_from_utc_ns(asked)])
     # 0.3 us of a float64 of seconds at 1.7 km/s are 0.5 mm. Windows of SPICE may lie one state to the side.
     near(states[:, :3], position, atol=1e-3)
@@ -86,23 +86,22 @@ def test_spk_gives_the_states_of_the_ephemeris(tmp_path, interpolation, degree, 
 def test_spk_keeps_the_segments_and_their_useable_intervals(tmp_path):
     burn = START + 1800 * NS
     before = arc(0, 2400, useable_stop_utc_ns=burn)
-    after = segment_of(np.arange(1200, 3601, 60), 1e-3, useable_start_utc_ns=burn)
-    ephemeris = Ephemeris((before, after))
+    ephemeris = Ephemeris((before, segment_of(np.arange(1200, 3601, 60), 1e-3, useable_start_utc_ns=burn)))
     with kernels(tmp_path, orbit=spk_kernel(ephemeris, CRAFT).octets) as spice:
         for seconds_after in (-1, 1):
             epoch = burn + seconds_after * NS
             state, _ = spice.spkgeo(CRAFT, float(et_from_utc_ns(epoch)), "J2000", 301)
             near(1e3 * state[:3], ephemeris.at(epoch)[0], atol=1e-3)
-        with pytest.raises(spiceypy.utils.exceptions.SpiceyError):
+        with raises(spiceypy.utils.exceptions.SpiceyError):
             spice.spkgeo(CRAFT, float(et_from_utc_ns(START + 3700 * NS)), "J2000", 301)
 
 
 def test_spk_of_lone_states_is_refused():
-    with pytest.raises(EphemerisError, match="expected a segment of at least two states, found none"):
+    with raises(EphemerisError, match="expected a segment of at least two states, found none"):
         spk_kernel(Ephemeris((arc(0, 0),)), CRAFT)
 
 
-@pytest.mark.parametrize("data_type", [3, 13])
+@mark.parametrize("data_type", [3, 13])
 def test_spk_is_read_as_the_ephemeris_it_came_from(tmp_path, data_type):
     ephemeris = Ephemeris((arc(0, 7200),))
     path = written(tmp_path / "orbit.bsp", *ephemeris.segments, data_type=data_type)
@@ -111,7 +110,7 @@ def test_spk_is_read_as_the_ephemeris_it_came_from(tmp_path, data_type):
     inner = read.utc_ns[1:-1]
     for asked in (inner, inner[:-1] + 29 * NS):
         near(read.at(asked)[0], ephemeris.at(asked)[0], atol=2e-3)
-    with pytest.raises(DataFileError, match=rf"expected body -5, found bodies {CRAFT}"):
+    with raises(DataFileError, match=rf"expected body -5, found bodies {CRAFT}"):
         load_spk(path, -5)
 
 
@@ -119,7 +118,7 @@ def test_an_spk_is_of_polynomials_where_these_are_exact_and_states_their_error()
     smooth = spk_kernel(Ephemeris((arc(0, 7200),)), CRAFT)
     assert (smooth.data_type, smooth.states) == (3, 8)  # records of 16 minutes
     assert smooth.error_m is not None and smooth.error_m < 1e-4
-    rng = np.random.default_rng(1)
+    rng = default_rng(1)
     seconds = np.cumsum(rng.uniform(30.0, 90.0, 60))
     position, velocity = circular(seconds)
     jagged = position + rng.normal(scale=50.0, size=(60, 3))
@@ -162,8 +161,7 @@ def test_an_spk_in_axes_that_need_other_kernels_is_refused_by_its_frame(tmp_path
     one = struct.pack("<iiii", CRAFT, 301, 1, 3)
     assert octets.count(one) == 1
     path.write_bytes(octets.replace(one, struct.pack("<iiii", CRAFT, 301, 123456, 3)))
-    expected = rf"body {CRAFT}: expected a reference frame out of J2000, .*, found '123456'"
-    with pytest.raises(UnknownFrameError, match=expected):
+    with raises(UnknownFrameError, match=rf"body {CRAFT}: expected a reference frame out of J2000, .*, found '123456'"):
         load_spk(path)
 
 
@@ -177,7 +175,7 @@ def test_a_gap_of_an_ephemeris_is_one_of_its_spk(tmp_path):
 def test_a_file_that_is_no_spk_is_refused_in_one_line(tmp_path):
     path = tmp_path / "orbit.bsp"
     path.write_bytes(b"DAF/SPK " + bytes(2000))
-    with pytest.raises(DataFileError, match=r"orbit\.bsp: expected an SPK, found") as caught:
+    with raises(DataFileError, match=r"orbit\.bsp: expected an SPK, found") as caught:
         load_spk(path)
     assert "\n" not in str(caught.value)
 
@@ -185,9 +183,8 @@ def test_a_file_that_is_no_spk_is_refused_in_one_line(tmp_path):
 def test_ck_clock_and_frame_turn_vectors_as_the_attitudes_do(tmp_path):
     utc_ns = START + np.arange(0, 600, 15) * NS
     ticks = ticks_from_utc_ns(utc_ns)
-    rng = np.random.default_rng(3)
-    start = rng.normal(size=4)
-    q_wxyz = start + 0.01 * np.arange(len(ticks))[:, None] * rng.normal(size=4)
+    rng = default_rng(3)
+    q_wxyz = rng.normal(size=4) + 0.01 * np.arange(len(ticks))[:, None] * rng.normal(size=4)
     q_wxyz /= np.linalg.norm(q_wxyz, axis=1, keepdims=True)
     q_wxyz[7] *= -1.0
     clock = format_sclk([ClockLine(int(ticks[0]) - 1000 * TICKS_PER_SECOND, START - 1000 * NS)], CRAFT)
@@ -205,7 +202,7 @@ def test_ck_clock_and_frame_turn_vectors_as_the_attitudes_do(tmp_path):
         middle = spice.pxform("J2000", "SELENITA_CAMERA", float(et_from_utc_ns(utc_ns[4] + 7 * NS)))
         assert np.allclose(middle @ middle.T, np.eye(3))
         outside = float(et_from_utc_ns(int(utc_ns[-1]) + 60 * NS))
-        with pytest.raises(spiceypy.utils.exceptions.SpiceyError):
+        with raises(spiceypy.utils.exceptions.SpiceyError):
             spice.pxform("J2000", "SELENITA_CAMERA", outside)
 
 
@@ -217,7 +214,7 @@ def test_clock_of_two_correlations_shows_each_from_its_start(tmp_path):
         for clock_s, real_s in ((1800, 1800.25), (3600, 3601.0), (7200, 3601.0 + 3600 * fast)):
             et = spice.sct2e(CRAFT, float(ticks + clock_s * TICKS_PER_SECOND))
             # Rates have 15 decimals, and a float64 of seconds 0.1 us.
-            assert et == pytest.approx(float(et_from_utc_ns(START + round(real_s * NS))), abs=5e-7)
+            assert et == approx(float(et_from_utc_ns(START + round(real_s * NS))), abs=5e-7)
 
 
 def test_field_of_view_is_that_of_the_camera(tmp_path):
@@ -228,8 +225,7 @@ def test_field_of_view_is_that_of_the_camera(tmp_path):
     assert (shape, frame, count) == ("POLYGON", "SELENITA_CAMERA", 4)
     assert_array_equal(boresight, [0.0, 0.0, 1.0])
     # 120 degrees between the edges of the image.
-    angle = np.degrees(np.arctan2(corners[:, 0], corners[:, 2]))
-    assert np.ptp(angle) == pytest.approx(120.0, abs=1e-9)
+    assert np.ptp(np.degrees(np.arctan2(corners[:, 0], corners[:, 2]))) == approx(120.0, abs=1e-9)
 
 
 def test_without_spiceypy_one_line_names_the_extra(monkeypatch):
@@ -241,5 +237,5 @@ def test_without_spiceypy_one_line_names_the_extra(monkeypatch):
         return usual(name, *rest)
 
     monkeypatch.setattr(builtins, "__import__", without)
-    with pytest.raises(MissingLibrary, match=r"expected the library spiceypy, found none; install linna\[spice\]"):
+    with raises(MissingLibrary, match=r"expected the library spiceypy, found none; install linna\[spice\]"):
         spk_kernel(Ephemeris((arc(0, 600),)), CRAFT)

@@ -1,7 +1,7 @@
 """STK .e files: an example laid out as the format's documentation shows it, both ways, and faults with their line."""
 
 import numpy as np
-import pytest
+from pytest import mark, raises
 
 from lunar.comparison import compare
 from lunar.constants import NS
@@ -76,7 +76,7 @@ def test_segments_that_meet_are_written_with_their_boundary_and_those_with_a_gap
     assert "BEGIN SegmentBoundaryTimes\n570.000000000\nEND" in text
     assert [len(s.utc_ns) for s in parse_stk(text).segments] == [20, 20]
     first, second = EphemerisSegment(*states(20)), EphemerisSegment(*states(20, 900.0))
-    with pytest.raises(EphemerisError, match="found a gap"):
+    with raises(EphemerisError, match="found a gap"):
         format_stk(Ephemeris((first, second)))
 
 
@@ -86,9 +86,7 @@ def test_a_boundary_at_a_state_also_a_rounded_one_splits_there_and_accelerations
     boundary = "1.2000000000e+02"
     rounded = text.replace(boundary, f"{float(boundary) + 4e-7:.9f}")
     assert [len(s.utc_ns) for s in parse_stk(rounded).segments] == [3, 2]
-    with pytest.raises(
-        DataFileError, match=r"SegmentBoundaryTimes: expected times of states, found .*Z, at which there"
-    ):
+    with raises(DataFileError, match=r"SegmentBoundaryTimes: expected times of states, found .*Z, at which there"):
         parse_stk(text.replace(boundary, f"{float(boundary) - 7.0:.3f}"))
     text = EXAMPLE.replace("EphemerisTimePosVel", "EphemerisTimePosVelAcc").replace("1.0e-01\n", "1.0e-01 0 0 0\n")
     assert len(parse_stk(text).utc_ns) == 4
@@ -124,20 +122,20 @@ Lagrange | Spline | line 9: expected InterpolationMethod
 """
 
 
-@pytest.mark.parametrize("text, message", [
+@mark.parametrize("text, message", [
     *((replaced(old, new), message) for old, new, message in rows_of(FAULTS)),
     ("", "line 1: expected stk.v.<version>, found nothing"),
     (EXAMPLE.partition("EphemerisTimePosVel")[0], "expected EphemerisTimePosVel, found the end of the file"),
 ])  # fmt: skip
 def test_a_faulty_file_is_refused_in_one_line_with_its_place(tmp_path, text, message):
     path = tmp_path / "faulty.e"
-    with pytest.raises(DataFileError) as caught:
+    with raises(DataFileError) as caught:
         parse_stk(text, source=str(path))
     assert str(caught.value).startswith(str(path)) and message in str(caught.value)
 
 
 def test_axes_and_time_formats_that_cannot_be_converted_are_refused():
-    with pytest.raises(UnknownFrameError, match=r"line 12: expected .*ICRF.* found 'Fixed'"):
+    with raises(UnknownFrameError, match=r"line 12: expected .*ICRF.* found 'Fixed'"):
         parse_stk(replaced("CoordinateSystem         J2000", "CoordinateSystem Fixed"))
-    with pytest.raises(UnknownTimeSystemError, match=r"TimeFormat: expected .*EpSec, found 'ISO-YMD'"):
+    with raises(UnknownTimeSystemError, match=r"TimeFormat: expected .*EpSec, found 'ISO-YMD'"):
         parse_stk(replaced("    CentralBody", "    TimeFormat ISO-YMD\n    CentralBody"))

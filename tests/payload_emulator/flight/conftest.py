@@ -4,6 +4,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
+from numpy import cos, nan, pi, radians, sin, sqrt, tan
 from pytest import fixture
 
 from lunar.arrays import FloatArray
@@ -20,7 +21,7 @@ GM_M3_S2 = 4.902800066e12
 MOON_RATE_RAD_S = 2.661699e-6
 EPOCH_TICKS = 61_000_000_000_000
 # 120 degrees over 512 pixels, written out here on purpose.
-FOCAL_PX = 256.0 / np.tan(np.radians(60.0))
+FOCAL_PX = 256.0 / tan(radians(60.0))
 CENTRE_PX = 255.5
 # Craters of 5 to 30 km per square metre, and the shares of the three classes (paper, section V-B).
 DENSITY_M2 = 2.09e-9
@@ -32,19 +33,19 @@ def paper_orbit_mcmf_m(seconds):
     """Return positions (n, 3) on the Kepler orbit of the paper's Table I over a uniformly turning Moon."""
     time = np.array(seconds, float)
     a, e = 1_768_180.0, 0.006908
-    i, node, perilune, start = np.radians([89.076, 3.164, 333.604, 8.882])
-    anomaly = 2.0 * np.arctan(np.sqrt((1.0 - e) / (1.0 + e)) * np.tan(start / 2.0))
-    mean = anomaly - e * np.sin(anomaly) + np.sqrt(GM_M3_S2 / a**3) * time
+    i, node, perilune, start = radians([89.076, 3.164, 333.604, 8.882])
+    anomaly = 2.0 * np.arctan(sqrt((1.0 - e) / (1.0 + e)) * tan(start / 2.0))
+    mean = anomaly - e * sin(anomaly) + sqrt(GM_M3_S2 / a**3) * time
     eccentric = mean.copy()
     for _ in range(12):
-        eccentric = mean + e * np.sin(eccentric)
-    true = 2.0 * np.arctan2(np.sqrt(1.0 + e) * np.sin(eccentric / 2.0), np.sqrt(1.0 - e) * np.cos(eccentric / 2.0))
-    radius, u, turned = a * (1.0 - e * np.cos(eccentric)), perilune + true, node - MOON_RATE_RAD_S * time
+        eccentric = mean + e * sin(eccentric)
+    true = 2.0 * np.arctan2(sqrt(1.0 + e) * sin(eccentric / 2.0), sqrt(1.0 - e) * cos(eccentric / 2.0))
+    radius, u, turned = a * (1.0 - e * cos(eccentric)), perilune + true, node - MOON_RATE_RAD_S * time
     return radius[:, None] * np.stack(
         [
-            np.cos(turned) * np.cos(u) - np.sin(turned) * np.sin(u) * np.cos(i),
-            np.sin(turned) * np.cos(u) + np.cos(turned) * np.sin(u) * np.cos(i),
-            np.sin(u) * np.sin(i),
+            cos(turned) * cos(u) - sin(turned) * sin(u) * cos(i),
+            sin(turned) * cos(u) + cos(turned) * sin(u) * cos(i),
+            sin(u) * sin(i),
         ],
         axis=1,
     )
@@ -53,8 +54,7 @@ def paper_orbit_mcmf_m(seconds):
 def place(position_m):
     """Return latitude, longitude, altitude."""
     radius = float(np.linalg.norm(position_m))
-    latitude = float(np.arcsin(position_m[2] / radius))
-    return latitude, float(np.arctan2(position_m[1], position_m[0])), radius - RADIUS_M
+    return float(np.arcsin(position_m[2] / radius)), float(np.arctan2(position_m[1], position_m[0])), radius - RADIUS_M
 
 
 def ticks_at(second):
@@ -71,14 +71,14 @@ class CraterField:
     def perfect_detections(self, position_m):
         """Return every crater in view of a nadir camera, image up to the north, by true perspective."""
         latitude, longitude, altitude = place(position_m)
-        reach = RADIUS_M * np.sin(np.arccos(RADIUS_M / (RADIUS_M + altitude)))
+        reach = RADIUS_M * sin(np.arccos(RADIUS_M / (RADIUS_M + altitude)))
         low, high = np.searchsorted(self.position_m[:, 2], [position_m[2] - reach, position_m[2] + reach])
         points, diameter = self.position_m[low:high], self.diameter_m[low:high]
-        up = np.array([np.cos(latitude) * np.cos(longitude), np.cos(latitude) * np.sin(longitude), np.sin(latitude)])
-        east = np.array([-np.sin(longitude), np.cos(longitude), 0.0])
+        up = np.array([cos(latitude) * cos(longitude), cos(latitude) * sin(longitude), sin(latitude)])
+        east = np.array([-sin(longitude), cos(longitude), 0.0])
         away = points - position_m
         depth = -away @ up
-        depth[depth <= 0.0] = np.nan
+        depth[depth <= 0.0] = nan
         u = CENTRE_PX + FOCAL_PX * (away @ east) / depth
         v = CENTRE_PX - FOCAL_PX * (away @ np.cross(up, east)) / depth
         seen = (np.abs(u - 255.5) < 256.0) & (np.abs(v - 255.5) < 256.0)
@@ -88,16 +88,16 @@ class CraterField:
 
 def make_crater_field(seed):
     rng = np.random.default_rng(seed)
-    count = int(4.0 * np.pi * RADIUS_M**2 * DENSITY_M2)
+    count = int(4.0 * pi * RADIUS_M**2 * DENSITY_M2)
     z = np.sort(rng.uniform(-1.0, 1.0, count))
-    longitude = rng.uniform(-np.pi, np.pi, count)
-    ring = np.sqrt(1.0 - z * z)
-    position = RADIUS_M * np.stack([ring * np.cos(longitude), ring * np.sin(longitude), z], axis=1)
+    longitude = rng.uniform(-pi, pi, count)
+    ring = sqrt(1.0 - z * z)
+    position = RADIUS_M * np.stack([ring * cos(longitude), ring * sin(longitude), z], axis=1)
     return CraterField(position, rng.choice(CLASS_DIAMETERS_M, size=count, p=CLASS_SHARES))
 
 
 def detections(u_px, v_px, diameter_px):
-    return Detections(u_px, v_px, diameter_px, np.ones_like(u_px), np.full_like(u_px, np.nan))
+    return Detections(u_px, v_px, diameter_px, np.ones_like(u_px), np.full_like(u_px, nan))
 
 
 @dataclass(frozen=True)

@@ -118,11 +118,9 @@ def test_a_place_outside_the_search_false_detections_and_two_detections_give_no_
     assert search(found, landmarks, prior, 7_000.0) is not None
     # 3.5 sigma are 7 km; cells at the edge of the search and the fit reach 5 km farther.
     assert search(found, landmarks, prior, 2_000.0) is None
-    landmarks = crater_map()
     for seed in range(12):
         found, _ = detected(landmarks, pose_at(), keep=0.0, false=14, seed=seed)
         assert search(found, landmarks, pose_at(), 5_000.0) is None
-    landmarks = crater_map()
     found, owner = detected(landmarks, pose_at(), noise_px=0.0, false=0)
     for count in (0, 1, 2):
         assert search(found.select(np.arange(count)), landmarks, pose_at(), 3_000.0) is None

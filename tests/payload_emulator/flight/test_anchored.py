@@ -3,6 +3,7 @@
 from dataclasses import replace
 
 import numpy as np
+from numpy import degrees, flatnonzero, inf, isfinite
 from numpy.linalg import norm
 from pytest import approx, fixture, mark
 
@@ -112,7 +113,7 @@ def test_the_payload_navigates_by_its_catalogue_and_reads_no_anchor(flight):
     position = flight.rotations[-1] @ flight.states[-1, :3]
     radius = float(norm(position))
     # Sightings here are exact: what is left is the gravity left out of the filter and the weight it gives to it.
-    assert last["latitude_deg"] == approx(np.degrees(np.arcsin(position[2] / radius)), abs=0.003)
+    assert last["latitude_deg"] == approx(degrees(np.arcsin(position[2] / radius)), abs=0.003)
     assert last["altitude_m"] == approx(radius - 1_737_400.0, abs=60.0)
     np.testing.assert_allclose(last["velocity_icrf_m_s"], flight.states[-1, 3:], atol=0.5)
     assert max(last["sigma_rtn_m"]) < 150.0
@@ -132,7 +133,7 @@ def test_a_damaged_table_is_reported_and_every_frame_refused(flight, name):
 
 
 def test_detections_with_numbers_that_are_none_are_passed_over_and_nothing_becomes_nan(flight):
-    bad = np.array([np.nan, np.inf, -np.inf, -5.0, 0.0, 1e300])
+    bad = np.array([np.nan, inf, -inf, -5.0, 0.0, 1e300])
     for k in range(4, 9):
         found = flight.frames[k][1]
         columns = {}
@@ -146,10 +147,9 @@ def test_detections_with_numbers_that_are_none_are_passed_over_and_nothing_becom
     packets = flight.fly(flight.payload())
     assert {values["outcome"] for values in named(packets, "frame_outcome")} == {int(Outcome.fixed)}
     for values in named(packets, "filter_estimate"):
-        assert np.all(np.isfinite(values["position_icrf_m"])) and np.all(np.isfinite(values["covariance"]))
+        assert np.all(isfinite(values["position_icrf_m"])) and np.all(isfinite(values["covariance"]))
     position = flight.rotations[-1] @ flight.states[-1, :3]
-    altitude_m = named(packets, "navigation_state")[-1]["altitude_m"]
-    assert altitude_m == approx(float(norm(position)) - 1_737_400.0, abs=60.0)
+    assert named(packets, "navigation_state")[-1]["altitude_m"] == approx(float(norm(position)) - 1_737_400.0, abs=60.0)
 
 
 @mark.parametrize("turn", ["mirrored", "rotated"])
@@ -172,7 +172,7 @@ def test_a_clock_that_jumps_leaves_the_estimate_finite(flight):
     packets = flight.fly(flight.payload())
     assert len(named(packets, "frame_outcome")) == FRAMES
     for values in named(packets, "navigation_state"):
-        assert np.isfinite(values["latitude_deg"]) and np.isfinite(values["altitude_m"])
+        assert isfinite(values["latitude_deg"]) and isfinite(values["altitude_m"])
 
 
 FRAME = 20
@@ -181,11 +181,11 @@ PARAMETERS = AnchoredParameters(gravity_degree=50)
 
 def frames_until_back(run):
     """Frames from the kidnap, itself included, to the first with an error below 500 m; 999 for never."""
-    good = np.flatnonzero(run.error_m[FRAME:] < 500.0)
+    good = flatnonzero(run.error_m[FRAME:] < 500.0)
     return int(good[0]) + 1 if good.size else 999
 
 
-@mark.parametrize(("distance_m", "announced", "limit"), [(5e3, False, 8), (20e3, True, 4), (20e3, False, 8)])
+@mark.parametrize("distance_m, announced, limit", [(5e3, False, 8), (20e3, True, 4), (20e3, False, 8)])
 def test_a_kidnapped_spacecraft_is_back_within_the_frames_allowed(navigation_case, distance_m, announced, limit):
     case = navigation_case(FRAME + 16, kidnap=Kidnap(FRAME, distance_m, announced), parameters=PARAMETERS)
     for seed in (1, 2):
@@ -198,10 +198,9 @@ def test_a_kidnapped_spacecraft_is_back_within_the_frames_allowed(navigation_cas
 def test_farther_than_any_widened_search_the_place_is_found_without_a_prior(navigation_case):
     case = navigation_case(FRAME + 24, kidnap=Kidnap(FRAME, 200e3, announced=False), parameters=PARAMETERS)
     # The part of the Moon about the track, so that a search takes moments.
-    near = np.flatnonzero(np.abs(np.degrees(case.craters.latitude_rad) - about_deg(case)[0]) < 35.0)
+    near = flatnonzero(np.abs(degrees(case.craters.latitude_rad) - about_deg(case)[0]) < 35.0)
     case = replace(case, craters=case.craters.select(near[turn_deg(case, near) < 25.0]))
-    lost = replace(PARAMETERS, lost_frames=10_000)
-    without = fly(replace(case, parameters=lost), 1)
+    without = fly(replace(case, parameters=replace(PARAMETERS, lost_frames=10_000)), 1)
     found = fly(replace(case, parameters=replace(PARAMETERS, lost=LostParameters())), 1)
     assert frames_until_back(without) == 999
     assert frames_until_back(found) <= 16
@@ -217,11 +216,11 @@ def about_deg(case):
     model = ForceModel(case.gravity, case.orientation, 10)
     flown = propagate(start, case.position_icrf_m, case.velocity_icrf_m_s, at - start + 1.0, model)
     place = case.orientation.mcmf_from_icrf(at) @ flown.state(at)[:3]
-    return np.degrees([np.arcsin(place[2] / np.linalg.norm(place)), np.arctan2(place[1], place[0])])
+    return degrees([np.arcsin(place[2] / norm(place)), np.arctan2(place[1], place[0])])
 
 
 def turn_deg(case, rows):
-    longitude = np.degrees(case.craters.longitude_rad[rows]) - about_deg(case)[1]
+    longitude = degrees(case.craters.longitude_rad[rows]) - about_deg(case)[1]
     return np.abs(np.mod(longitude + 180.0, 360.0) - 180.0)
 
 
@@ -229,13 +228,12 @@ def turn_deg(case, rows):
 def test_a_stale_catalogue_misleads_nobody(navigation_case, wrong_share):
     errors = CatalogueErrors(wrong_share=wrong_share)
     # Without the search of the whole Moon, which takes a second a frame on this map.
-    parameters = replace(PARAMETERS, lost_frames=10_000)
-    run = fly(navigation_case(40, catalogue_errors=errors, parameters=parameters), 3)
-    assert np.all(np.isfinite(run.error_rtn_m))
+    run = fly(navigation_case(40, catalogue_errors=errors, parameters=replace(PARAMETERS, lost_frames=10_000)), 3)
+    assert np.all(isfinite(run.error_rtn_m))
     late = slice(20, None)
     if wrong_share < 1.0:
         assert np.median(run.error_m[late]) < 200.0
     else:
         # Nothing on board is where it should be: hardly a fix is believed, and the claimed sigma grows past the error.
         assert np.mean(run.fixed) < 0.2
-        assert np.median(run.error_m[late]) < 4.0 * np.median(np.linalg.norm(run.sigma_rtn_m[late], axis=1))
+        assert np.median(run.error_m[late]) < 4.0 * np.median(norm(run.sigma_rtn_m[late], axis=1))

@@ -3,6 +3,7 @@
 from dataclasses import replace
 
 import numpy as np
+from numpy import cross, diag, eye, hypot, inf, isnan, nan, radians, sqrt, tan
 from numpy.linalg import norm
 from numpy.testing import assert_allclose, assert_array_equal
 from pytest import approx, fixture, mark
@@ -132,12 +133,12 @@ def test_shipped_parameters_hold_the_orbit_and_report_what_the_state_says(orbit)
     radius = float(norm(place))
     assert last.altitude_m == approx(radius - 1_737_400.0, abs=1e-6)
     assert np.sin(last.latitude_rad) == approx(place[2] / radius, abs=1e-12)
-    assert np.tan(last.longitude_rad) == approx(place[1] / place[0], rel=1e-9)
+    assert tan(last.longitude_rad) == approx(place[1] / place[0], rel=1e-9)
     radial = state.mean[:3] / norm(state.mean[:3])
-    normal = np.cross(state.mean[:3], state.mean[3:6])
+    normal = cross(state.mean[:3], state.mean[3:6])
     normal /= norm(normal)
-    axes = np.stack([radial, np.cross(normal, radial), normal])
-    expected = [np.sqrt(axis @ state.covariance[:3, :3] @ axis) for axis in axes]
+    axes = np.stack([radial, cross(normal, radial), normal])
+    expected = [sqrt(axis @ state.covariance[:3, :3] @ axis) for axis in axes]
     assert_allclose(last.sigma_rtn_m, expected, rtol=1e-9)
     assert last.velocity_icrf_m_s == tuple(state.mean[3:6])
     fix = navigator.fix
@@ -149,7 +150,7 @@ def test_without_an_image_attitude_or_detections_the_orbit_is_coasted(orbit):
     navigator = orbit.flown(6)
     before = navigator.estimate
     none = navigator.frame(6, None, orbit.attitude(6))
-    assert none.outcome is Outcome.no_image and np.isnan(none.nis) and none.matched == 0
+    assert none.outcome is Outcome.no_image and isnan(none.nis) and none.matched == 0
     assert navigator.estimate.position_sigma_m > before.position_sigma_m
     blind = navigator.frame(7, orbit.detections(7), None)
     empty = navigator.frame(8, orbit.detections(8).select(slice(0)), orbit.attitude(8))
@@ -161,7 +162,7 @@ def test_outside_the_orientation_table_the_old_state_stays(orbit):
     navigator = orbit.flown(3)
     before = navigator.state
     report = navigator.step(orbit.ticks[3] + 400 * 86_400 * SECOND, orbit.detections(3), orbit.attitude(3))
-    assert report.outcome is Outcome.refused and np.isnan(report.latitude_rad)
+    assert report.outcome is Outcome.refused and isnan(report.latitude_rad)
     assert navigator.state is before
 
 
@@ -192,7 +193,7 @@ def test_detection_noise_is_split_between_frame_and_crater(orbit):
     found = orbit.detections(0)
     count = len(found)
     sigma = np.full(count, 0.1)
-    sigma[:2] = [np.nan, 1.0]
+    sigma[:2] = [nan, 1.0]
     parameters = navigator.setup.parameters
     variance = correction.detection_variance_px2(replace(found, sigma_px=sigma), parameters)
     # Unknown: 1.5 px; given: twice what it says; never below 0.5 px.
@@ -216,12 +217,12 @@ def test_detection_noise_is_split_between_frame_and_crater(orbit):
     catalogue_m = navigator.state.landmarks.sigma_m[index]
     lasting = correction.crater_sigma_m(catalogue_m, np.array([1.2, 2.7]), altitude_m, orbit.case.camera, parameters)
     low = correction.crater_sigma_m(catalogue_m, np.array([1.2, 2.7]), low_m, orbit.case.camera, parameters)
-    focal_px = 256.0 / np.tan(np.radians(60.0))
+    focal_px = 256.0 / tan(radians(60.0))
     for row, px2 in enumerate((4.0, 9.0)):
-        across = np.hypot(60.0, np.sqrt(0.3 * px2) * altitude_m / focal_px)
+        across = hypot(60.0, sqrt(0.3 * px2) * altitude_m / focal_px)
         assert_allclose(lasting[row], [across, across, 60.0], rtol=1e-12)
         # Below the lowest altitude the scale of that altitude is used.
-        across = np.hypot(60.0, np.sqrt(0.3 * px2) * 1_000.0 / focal_px)
+        across = hypot(60.0, sqrt(0.3 * px2) * 1_000.0 / focal_px)
         assert_allclose(low[row], [across, across, 60.0], rtol=1e-12)
     # The map itself is left alone.
     assert_allclose(navigator.state.landmarks.sigma_m[index], 60.0)
@@ -242,7 +243,7 @@ def test_craters_enter_the_state_with_the_lasting_share_of_the_detection_error(o
         assert navigator.estimate.craters.size > 5
         covariance, east = navigator.estimate.covariance, np.arange(kalman.SIZE, navigator.estimate.mean.size, 3)
         beyond = covariance[east, east] + covariance[14, 14] - 2.0 * covariance[14, east]
-        spread.append(np.sqrt(beyond))
+        spread.append(sqrt(beyond))
     assert spread[0].max() <= 60.0  # the catalogue's own, beyond the common offset
     assert spread[1].min() > 120.0
 
@@ -260,23 +261,15 @@ def test_an_image_that_contradicts_the_prediction_is_refused_until_it_has_done_s
     assert navigator.state.disagreements == 0
 
 
-@mark.parametrize(
-    "matched, expected, detections, counts",
-    [
-        (None, 10, 10, 1),
-        (None, 3, 10, 0),
-        (None, 10, 3, 0),
-        (None, 4, 4, 1),
-        (2, 10, 10, 1),
-        (3, 10, 10, -1),
-        (1, 3, 9, -1),
-        # A fix uses 32 craters at most.
-        (31, 400, 250, 1),
-        (32, 400, 250, -1),
-    ],
-)
-def test_frames_are_judged_by_the_share_they_explain(matched, expected, detections, counts):
-    fix = None if matched is None else type("Fix", (), {"index": np.arange(matched)})()
+# matched (- without a fix), expected, detections, counts; a fix uses 32 craters at most
+FRAMES = "- 10 10 1, - 3 10 0, - 10 3 0, - 4 4 1, 2 10 10 1, 3 10 10 -1, 1 3 9 -1, 31 400 250 1, 32 400 250 -1"
+
+
+@mark.parametrize("row", FRAMES.split(","))
+def test_frames_are_judged_by_the_share_they_explain(row):
+    matched, *others = row.split()
+    expected, detections, counts = map(int, others)
+    fix = None if matched == "-" else type("Fix", (), {"index": np.arange(int(matched))})()
     after = recovery.disagreements(5, fix, expected, detections, AnchoredParameters())
     assert after == (0 if counts < 0 else 5 + counts)
 
@@ -284,7 +277,7 @@ def test_frames_are_judged_by_the_share_they_explain(matched, expected, detectio
 def test_corrections_that_are_no_corrections_are_refused(orbit):
     prior, limits = orbit.navigator().estimate, AnchoredLimits()
     sigma = prior.position_sigma_m
-    assert sigma == approx(300.0 / np.sqrt(3.0))
+    assert sigma == approx(300.0 / sqrt(3.0))
 
     def moved(metres):
         mean = prior.mean.copy()
@@ -296,7 +289,7 @@ def test_corrections_that_are_no_corrections_are_refused(orbit):
     bad = replace(prior, covariance=prior.covariance.copy())
     bad.covariance[4, 4] = -1e-9
     assert not correction.is_plausible(prior, bad, limits)
-    assert not correction.is_plausible(prior, replace(prior, mean=np.full(18, np.nan)), limits)
+    assert not correction.is_plausible(prior, replace(prior, mean=np.full(18, nan)), limits)
     for radius, usable in ((1_727.3e3, False), (1_727.5e3, True), (2_737.3e3, True), (2_737.5e3, False)):
         mean = prior.mean.copy()
         mean[:3] *= radius / norm(mean[:3])
@@ -315,8 +308,8 @@ def test_a_burn_on_the_way_is_flown_and_its_uncertainty_added(orbit):
     assert_allclose(moved[:3], 10.0 * push, atol=1e-2)
     assert_allclose(moved[3:6], push, atol=1e-3)
     added = burning.estimate.covariance - plain.estimate.covariance
-    assert_allclose(np.diag(added)[3:6], 0.05**2, rtol=1e-3)
-    assert_allclose(np.diag(added)[:3], (10.0 * 0.05) ** 2, rtol=1e-3)
+    assert_allclose(diag(added)[3:6], 0.05**2, rtol=1e-3)
+    assert_allclose(diag(added)[:3], (10.0 * 0.05) ** 2, rtol=1e-3)
     # Back before the burn it is undone.
     burning.frame(0, None, None)
     plain.frame(0, None, None)
@@ -332,12 +325,11 @@ def test_it_is_lost_beyond_its_limit(orbit):
     wider = anchored.widened(wide, 1_500.0, 1.0)
     assert anchored.is_lost(wider, parameters)
     assert wider.estimate.position_sigma_m == approx(5_127.3, abs=1.0)
-    unknown = replace(wide, estimate=replace(wide.estimate, mean=np.full(18, np.nan)))
+    unknown = replace(wide, estimate=replace(wide.estimate, mean=np.full(18, nan)))
     assert anchored.is_lost(unknown, parameters)
     # The report of a frame says so.
     navigator.state = wider
-    report = navigator.frame(1, None, None)
-    assert report.lost and not orbit.navigator().frame(1, None, None).lost
+    assert navigator.frame(1, None, None).lost and not orbit.navigator().frame(1, None, None).lost
 
 
 def test_a_wide_prior_is_searched_by_votes_and_says_so(orbit):
@@ -367,7 +359,7 @@ def test_a_place_found_without_a_prior_turns_the_orbit_with_it(orbit, monkeypatc
     navigator = orbit.navigator()
     prior = navigator.estimate
     found = orbit.detections(0)
-    axis = np.cross(prior.mean[:3], [0.3, -0.5, 0.8])
+    axis = cross(prior.mean[:3], [0.3, -0.5, 0.8])
     turn = Rotation.from_rotvec(0.4 * axis / norm(axis))
     there = 1.01 * turn.apply(prior.mean[:3])
     place = PoseHypothesis(
@@ -397,7 +389,7 @@ def test_a_place_found_without_a_prior_turns_the_orbit_with_it(orbit, monkeypatc
     assert_allclose(fresh.mean[:3], there, rtol=1e-12)
     assert_allclose(fresh.mean[3:6], turn.apply(prior.mean[3:6]), rtol=1e-9)
     assert fresh.ticks == prior.ticks and not fresh.craters.size
-    sigma = np.sqrt(np.diag(fresh.covariance))
+    sigma = sqrt(diag(fresh.covariance))
     # Three times the worst of 30, 80 and 50 m, and 200 m; a metre a second and 1e-3/s of the way.
     assert_allclose(sigma[:3], 440.0)
     assert_allclose(sigma[3:6], 1.0 + 1e-3 * norm(there - prior.mean[:3]))
@@ -412,9 +404,9 @@ def test_a_place_found_without_a_prior_turns_the_orbit_with_it(orbit, monkeypatc
 
 
 @mark.parametrize(
-    ("moved_m", "unseen_s", "velocity_m_s"),
+    "moved_m, unseen_s, velocity_m_s",
     [
-        (2_000.0, np.inf, 2.0),  # no fix so far: 1e-3/s of the distance
+        (2_000.0, inf, 2.0),  # no fix so far: 1e-3/s of the distance
         (2_000.0, 4_000.0, 2.0),  # the last fix is a coast ago
         (2_000.0, 500.0, 4.0),  # what moved the estimate came after the last fix
         (2_000.0, 60.0, 8.0),  # not more than the radius of the search stands for
@@ -431,8 +423,7 @@ def test_a_widened_search_adds_the_distance_of_the_place_to_the_uncertainty(
     pose = orbit.pose(prior.mean[:3])
     away = replace(pose, position_icrf_m=pose.position_icrf_m + np.array([0.0, moved_m, 0.0]))
     none = np.empty(0, int)
-    place = Acquisition(none, none, away, 5, 3)
-    acquired = recorded(monkeypatch, recovery, "acquire", place)
+    acquired = recorded(monkeypatch, recovery, "acquire", Acquisition(none, none, away, 5, 3))
     corrected = []
     monkeypatch.setattr(recovery, "correct", lambda *given, **named: corrected.append((given, named)))
     parameters = navigator.setup.parameters
@@ -441,7 +432,7 @@ def test_a_widened_search_adds_the_distance_of_the_place_to_the_uncertainty(
     assert acquired[0][4] == 8_000.0
     (given, named) = corrected[0]
     added = np.zeros_like(prior.covariance)
-    added[:3, :3], added[3:6, 3:6] = np.eye(3) * moved_m**2, np.eye(3) * velocity_m_s**2
+    added[:3, :3], added[3:6, 3:6] = eye(3) * moved_m**2, eye(3) * velocity_m_s**2
     assert_allclose(given[0].covariance - prior.covariance, added, rtol=1e-9, atol=1e-6)
     assert_array_equal(given[0].mean, prior.mean)
     assert named == {"reacquired": True, "method": kalman}
@@ -487,8 +478,7 @@ def test_a_reacquisition_leaves_out_the_pair_that_all_others_contradict(orbit, m
         assert correction._is_credible(prior, judged, limits) is credible
     # What a linear correction leaves of the velocity is added to its uncertainty.
     monkeypatch.setattr(correction, "curvature_m_s", lambda *_: 7.0)
-    bent = fix(count, found)
-    added = np.diag(bent.update.state.covariance - whole.update.state.covariance)
+    added = diag(fix(count, found).update.state.covariance - whole.update.state.covariance)
     assert_allclose(added[:6], [0.0, 0.0, 0.0, 49.0, 49.0, 49.0], rtol=1e-4)
 
 
@@ -516,7 +506,7 @@ def test_the_time_since_the_last_fix_goes_into_the_widened_search(orbit, monkeyp
 
     assert navigator.state.fixed_ticks == orbit.ticks[2]
     navigator.frame(4, empty, orbit.attitude(4))
-    assert [given[-2] for given in widened] == [np.inf, 30.0]
+    assert [given[-2] for given in widened] == [inf, 30.0]
 
 
 def test_a_reset_of_the_filter_drops_the_predictions_of_the_window(orbit, monkeypatch):
@@ -550,8 +540,7 @@ def test_an_estimate_that_left_the_moon_starts_again_from_the_tables(orbit):
     below[:3] *= 0.9
     broken = FilterState(navigator.estimate.ticks, below, navigator.estimate.covariance, navigator.estimate.craters)
     navigator.state = replace(navigator.state, estimate=broken)
-    report = navigator.frame(3)
-    assert report.outcome is Outcome.fixed and orbit.error_m(navigator, 3) < 200.0
+    assert navigator.frame(3).outcome is Outcome.fixed and orbit.error_m(navigator, 3) < 200.0
 
 
 def test_disagreeing_frames_widen_the_search_and_then_give_the_prior_up(orbit, monkeypatch):
@@ -581,12 +570,12 @@ def test_disagreeing_frames_widen_the_search_and_then_give_the_prior_up(orbit, m
 
 def test_craters_are_looked_for_as_far_outside_as_the_position_may_be_off(orbit, monkeypatch):
     """3.5 sigma over the altitude times the focal length, and 200 px at most."""
-    focal_px = 256.0 / np.tan(np.radians(60.0))
+    focal_px = 256.0 / tan(radians(60.0))
     for sigma_m in (300.0, 1_400.0, 3_500.0):
         navigator = orbit.navigator(tracking_limit_m=5_000.0)
         prior = navigator.estimate
         wide = np.zeros_like(prior.covariance)
-        wide[:3, :3] = np.eye(3) * sigma_m**2
+        wide[:3, :3] = eye(3) * sigma_m**2
         prior = replace(prior, covariance=wide)
         pose = orbit.pose(prior.mean[:3])
         nothing = in_view(orbit.map, pose, orbit.case.camera, 0.0).select(slice(0))
@@ -608,8 +597,7 @@ def test_what_identification_is_given_is_the_spread_of_prediction_and_catalogue(
     sighting = in_view(landmarks, pose, orbit.case.camera, 0.0)
     calls = recorded(monkeypatch, correction, "identify", "pairs")
     found = orbit.detections(2)
-    pairs = correction.associate(prior, sighting, found, landmarks, orbit.case.camera, parameters)
-    assert pairs == "pairs"
+    assert correction.associate(prior, sighting, found, landmarks, orbit.case.camera, parameters) == "pairs"
     ((given, seen, spread, own, variance, area_px2, rules, place),) = calls
     assert given is found and seen is sighting and rules is parameters.identification
     assert area_px2 == 512.0 * 512.0
@@ -621,7 +609,7 @@ def test_what_identification_is_given_is_the_spread_of_prediction_and_catalogue(
     for k in range(count):
         here = slice(2 * k, 2 * k + 2)
         rows[here, :3], rows[here, 9:12] = sighting.by_position[k], sighting.by_attitude[k]
-        rows[here, 12:14], rows[here, 17] = np.eye(2), sighting.by_scale[k]
+        rows[here, 12:14], rows[here, 17] = eye(2), sighting.by_scale[k]
         column = slots[k] if slots[k] >= 0 else 14
         rows[here, column : column + 3] = sighting.by_offset[k]
     noise = parameters.errors.attitude_noise_rad
@@ -631,7 +619,7 @@ def test_what_identification_is_given_is_the_spread_of_prediction_and_catalogue(
     for k in range(count):
         expected = np.zeros((2, 2))
         if slots[k] < 0:
-            expected = sighting.by_offset[k] @ np.diag([3_600.0] * 3) @ sighting.by_offset[k].T
+            expected = sighting.by_offset[k] @ diag([3_600.0] * 3) @ sighting.by_offset[k].T
         assert_allclose(own[k], expected, rtol=1e-9, atol=1e-12)
         at = sighting.by_position[k]
         assert_allclose(place[k], at @ prior.covariance[:3, :3] @ at.T, rtol=1e-9)
@@ -640,7 +628,7 @@ def test_what_identification_is_given_is_the_spread_of_prediction_and_catalogue(
 def at_altitude(altitude_m):
     mean = np.zeros(18)
     mean[0] = 1_737_400.0 + altitude_m
-    return FilterState(0, mean, np.eye(18), np.empty(0, int))
+    return FilterState(0, mean, eye(18), np.empty(0, int))
 
 
 def test_limits_of_a_search_grow_with_the_altitude():
@@ -684,7 +672,7 @@ def test_the_map_is_shown_the_frame_as_corrected_and_what_no_crater_explains(orb
     # Without a fix the attitude is taken as measured, with its bias and its noise.
     anchored.map_frame(navigator.state, None, stray, attitude, orbit.rotations[2], setup)
     errors = setup.parameters.errors
-    assert calls[1][1].attitude_sigma_rad == approx(np.hypot(errors.attitude_bias_rad, errors.attitude_noise_rad))
+    assert calls[1][1].attitude_sigma_rad == approx(hypot(errors.attitude_bias_rad, errors.attitude_noise_rad))
     turn = Rotation.from_rotvec(-state.mean[9:12]).as_matrix()
     assert_allclose(calls[1][1].camera_from_mcmf, turn @ orbit.attitude(2) @ rotation.T, atol=1e-12)
 

@@ -3,6 +3,7 @@
 from dataclasses import replace
 
 import numpy as np
+from numpy import diag, radians
 from numpy.random import default_rng
 from numpy.testing import assert_allclose, assert_array_equal
 from pytest import approx, mark
@@ -28,11 +29,11 @@ from payload_emulator.flight.navigation.sighting import landmark_map
 from studies import montecarlo
 
 FOCAL_PX = PinholeCamera().focal_px
-DECLARED = np.radians(0.01)
+DECLARED = radians(0.01)
 RULES = MonitorParameters()
 FLOOR = RULES.floor_px / FOCAL_PX
 # What else is uncertain about a rotation in a usual frame, about each axis.
-OTHERS = np.radians([0.15, 0.2, 0.1])
+OTHERS = radians([0.15, 0.2, 0.1])
 
 
 def frames(count, noise_rad, seed=1, common_rad=(0.0, 0.0, 0.0), used_rad=DECLARED, trial=False):
@@ -40,7 +41,7 @@ def frames(count, noise_rad, seed=1, common_rad=(0.0, 0.0, 0.0), used_rad=DECLAR
     rng, found = default_rng(seed), []
     for _ in range(count):
         axes = Rotation.random(rng=rng).as_matrix()
-        variance = axes @ np.diag(OTHERS**2) @ axes.T
+        variance = axes @ diag(OTHERS**2) @ axes.T
         information = np.linalg.inv(variance + used_rad**2 * np.eye(3))
         seen = np.array(common_rad) + noise_rad * rng.standard_normal(3)
         seen = seen + axes @ (OTHERS * rng.standard_normal(3))
@@ -59,17 +60,16 @@ def judged(evidence, monitor=None):
 @mark.parametrize("noise_deg", [0.01, 0.2, 1.0])
 @mark.parametrize("used_deg", [0.01, 1.0])
 def test_the_variance_of_the_attitude_is_estimated_without_bias(noise_deg, used_deg):
-    evidence = frames(3_000, np.radians(noise_deg), used_rad=np.radians(used_deg))
-    shown = frame_variances(tuple(evidence), FLOOR)
+    shown = frame_variances(tuple(frames(3_000, radians(noise_deg), used_rad=radians(used_deg))), FLOOR)
     # 3,000 frames; the best known axis counts most, so that the three count as one and a half.
-    error = np.radians(0.25) ** 2 if noise_deg < 0.5 else np.radians(1.03) ** 2
-    used = max(error, np.radians(used_deg) ** 2)
-    assert shown.mean == approx(np.radians(noise_deg) ** 2, abs=4.0 * used * np.sqrt(2.0 / 4_500.0))
+    error = radians(0.25) ** 2 if noise_deg < 0.5 else radians(1.03) ** 2
+    used = max(error, radians(used_deg) ** 2)
+    assert shown.mean == approx(radians(noise_deg) ** 2, abs=4.0 * used * np.sqrt(2.0 / 4_500.0))
 
 
 def test_a_rotation_common_to_all_frames_is_no_noise():
-    turn = np.radians([0.8, -0.5, 0.3])
-    assert frame_variances(tuple(frames(24, 0.0, common_rad=turn)), FLOOR).mean < np.radians(0.1) ** 2
+    turn = radians([0.8, -0.5, 0.3])
+    assert frame_variances(tuple(frames(24, 0.0, common_rad=turn)), FLOOR).mean < radians(0.1) ** 2
     # Agreeing frames and frames that have to be turned are two groups: the second has the shift of a wrong position.
     mixed = frames(12, 0.0) + frames(12, 0.0, seed=2, common_rad=turn, trial=True)
     assert not any(one.degraded for one in judged(mixed))
@@ -93,29 +93,28 @@ def test_a_sensor_as_declared_or_better_is_left_alone():
             assert not any(one.degraded for one in judged(frames(60, noise, seed)))
 
 
-@mark.parametrize(("noise_deg", "within"), [(0.2, 24), (1.0, 6)])
+@mark.parametrize("noise_deg, within", [(0.2, 24), (1.0, 6)])
 def test_more_noise_is_detected_and_estimated(noise_deg, within):
     for seed in range(10):
-        after = judged(frames(60, DECLARED, seed) + frames(40, np.radians(noise_deg), seed + 100))
-        first = next(k for k, one in enumerate(after) if one.degraded)
-        assert 60 <= first < 60 + within
+        after = judged(frames(60, DECLARED, seed) + frames(40, radians(noise_deg), seed + 100))
+        assert 60 <= next(k for k, one in enumerate(after) if one.degraded) < 60 + within
         # The mean of 24 frames is known to a quarter, and one standard error is added.
-        assert 0.8 < after[-1].noise_rad / np.radians(noise_deg) < 1.6
+        assert 0.8 < after[-1].noise_rad / radians(noise_deg) < 1.6
         assert after[-1].sigma_rad(DECLARED) == after[-1].noise_rad
 
 
 def test_wrong_pairs_in_two_of_five_frames_are_no_bad_sensor():
-    good, bad = frames(30, 0.0), frames(2, np.radians(2.0), seed=9)
+    good, bad = frames(30, 0.0), frames(2, radians(2.0), seed=9)
     assert not any(one.degraded for one in judged(good + bad[:1] + good[:1] + bad[1:] + good[:5]))
 
 
 def test_the_declared_noise_is_used_again_once_the_sensor_is_restored_and_none_above_the_limit():
-    noisy = judged(frames(40, np.radians(0.5)))[-1]
+    noisy = judged(frames(40, radians(0.5)))[-1]
     assert noisy.degraded
     after = judged(frames(30, DECLARED, seed=5, used_rad=noisy.noise_rad), noisy)
     assert after[0].degraded and not after[-1].degraded
     assert after[-1].noise_rad == 0.0 and after[-1].sigma_rad(DECLARED) == DECLARED
-    assert judged(frames(30, np.radians(6.0)))[-1].noise_rad == RULES.largest_rad
+    assert judged(frames(30, radians(6.0)))[-1].noise_rad == RULES.largest_rad
 
 
 def test_frames_that_need_a_turn_are_examined_until_there_are_enough_of_them():
@@ -130,7 +129,7 @@ def flown(navigation_case, seed, noise_deg, watched=True):
     if not watched:
         never = DetectionRule(24, 0.2, np.inf)
         parameters = replace(parameters, monitor=replace(parameters.monitor, moderate=never, sudden=never))
-    return montecarlo.fly(navigation_case(60, attitude_noise_rad=np.radians(noise_deg), parameters=parameters), seed)
+    return montecarlo.fly(navigation_case(60, attitude_noise_rad=radians(noise_deg), parameters=parameters), seed)
 
 
 @mark.parametrize("noise_deg", [0.001, 0.01])
@@ -154,8 +153,7 @@ def test_a_bad_sensor_is_detected_and_tolerated_on_passes(navigation_case, monke
         assert np.median(run.error_m[20:]) < 250.0 and run.error_m[20:].max() < 500.0
     # One run is one independent draw of six degrees of freedom: three of them exceed 11 once in a thousand.
     assert np.mean([run.nees[20:].mean() for run in runs]) < 11.0
-    without = flown(navigation_case, 31, 1.0, watched=False)
-    assert without.nees[20:].mean() > 30.0
+    assert flown(navigation_case, 31, 1.0, watched=False).nees[20:].mean() > 30.0
 
 
 def test_moderate_noise_is_detected_within_a_window_of_frames(navigation_case):
@@ -166,7 +164,7 @@ def test_moderate_noise_is_detected_within_a_window_of_frames(navigation_case):
 
 
 def test_a_degraded_attitude_takes_back_the_fixes_of_the_window_and_counts_with_its_noise(navigation_case, monkeypatch):
-    noise = np.radians(0.5)
+    noise = radians(0.5)
     used = []
     usual = kalman.update
 
@@ -183,8 +181,7 @@ def test_a_degraded_attitude_takes_back_the_fixes_of_the_window_and_counts_with_
     before = state.estimate
     # The estimate goes back to the oldest prediction that the window still has, here one without any error.
     exact = replace(before, mean=before.mean + 1.0, covariance=2.0 * before.covariance)
-    later = replace(exact, ticks=int(ticks[1]))
-    full = (exact, *[later] * (setup.parameters.monitor.window_frames - 1))
+    full = (exact, *[replace(exact, ticks=int(ticks[1]))] * (setup.parameters.monitor.window_frames - 1))
     watching = replace(state, trusted=full, attitude=AttitudeMonitor(window=tuple(frames(24, 0.0))))
     back = anchored.with_judged_attitude(watching, degraded, None, setup)
     assert_allclose(back.estimate.mean, exact.mean, rtol=1e-6)
@@ -193,7 +190,7 @@ def test_a_degraded_attitude_takes_back_the_fixes_of_the_window_and_counts_with_
     # After a reset of the filter within the window nothing is left to go back to: the uncertainty grows.
     after = anchored.with_judged_attitude(state, degraded, None, setup)
     shift = noise * anchored.altitude_above_sphere_m(before)
-    added = np.diag(after.estimate.covariance - before.covariance)
+    added = diag(after.estimate.covariance - before.covariance)
     assert_allclose(added[:3], shift**2)
     assert_allclose(added[3:6], (1e-3 * shift) ** 2)
     assert_allclose(added[6:], 0.0)

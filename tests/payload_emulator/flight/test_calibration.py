@@ -60,7 +60,7 @@ def test_the_hash_of_a_network_does_not_depend_on_its_metadata_which_are_loaded_
 
 
 @mark.parametrize(
-    ("change", "said"),
+    "change, said",
     [
         ({"version": 2}, "expected version 1, found 2"),
         ({"network_sha256": "0" * 64}, "expected a calibration of this network"),

@@ -22,8 +22,7 @@ def request(count):
 
 
 def test_packets_laid_end_to_end_are_cut_and_named():
-    octets = packet(5) + packet(16_383, source=7, acknowledge=9)
-    first, second = parse_commands(octets)
+    first, second = parse_commands(packet(5) + packet(16_383, source=7, acknowledge=9))
     assert isinstance(first, Command) and isinstance(second, Command)
     assert (first.name, first.values, first.request_id) == ("test_connection", {}, request(5))
     assert (first.acknowledgements, first.packet, first.sequence_count) == (15, packet(5), 5)
@@ -53,8 +52,7 @@ def test_a_broken_length_ends_the_reading_and_a_broken_packet_does_not():
 def test_octets_too_few_for_a_packet_are_refused_by_what_there_is_of_its_name(kept):
     (found,) = parse_commands(packet(5)[:kept])
     # The request id is the first four octets, and nought where there are fewer.
-    named = int.from_bytes((packet(5)[:kept] + bytes(4))[:4], "big")
-    assert found == Refusal(named, BAD_LENGTH)
+    assert found == Refusal(int.from_bytes((packet(5)[:kept] + bytes(4))[:4], "big"), BAD_LENGTH)
 
 
 def test_a_packet_too_short_for_a_telecommand_or_for_its_fields_has_a_wrong_length():
@@ -62,8 +60,7 @@ def test_a_packet_too_short_for_a_telecommand_or_for_its_fields_has_a_wrong_leng
     short = packet(5)[:4] + (5).to_bytes(2, "big") + bytes(6)
     assert list(parse_commands(short + packet(6))) == [Refusal(request(5), BAD_LENGTH)]
     # Service 8, subtype 1 carries a function and two arguments, 18 octets.
-    full = packet(9, bytes([0, 1]) + bytes(16), service=8)
-    assert isinstance(next(parse_commands(full)), Command)
+    assert isinstance(next(parse_commands(packet(9, bytes([0, 1]) + bytes(16), service=8))), Command)
     for octets in (17, 8, 0):
         (found,) = parse_commands(packet(9, (bytes([0, 1]) + bytes(16))[:octets], service=8))
         assert found == Refusal(request(9), BAD_LENGTH), octets
@@ -83,7 +80,7 @@ def noted(*packets):
 
 
 @mark.parametrize(
-    ("count", "code"),
+    "count, code",
     [
         (100, OUT_OF_SEQUENCE), (99, OUT_OF_SEQUENCE), (101, 0), (8_291, 0), (8_292, OUT_OF_SEQUENCE),
         (16_383, OUT_OF_SEQUENCE)

@@ -6,6 +6,8 @@ import json
 import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
+from numpy import cos, hypot, nan, pi, sin
+from numpy.random import default_rng
 from pytest import approx, fixture, mark, raises
 
 from payload_emulator.errors import ModelError
@@ -54,11 +56,9 @@ def detector():
 @mark.parametrize("azimuth", [0.0, 90.0, 180.0, 270.0])
 def test_fresh_bowls_are_found_where_they_are_whatever_the_sun(detector, azimuth):
     angle = np.radians(azimuth)
-    found = detector.detect(
-        bowl_image(CENTRES, sun_azimuth_deg=azimuth), np.array([np.sin(angle), -np.cos(angle), 0.25])
-    )
+    found = detector.detect(bowl_image(CENTRES, sun_azimuth_deg=azimuth), np.array([sin(angle), -cos(angle), 0.25]))
     for u, v in CENTRES:
-        distance = np.hypot(found.u_px - u, found.v_px - v)
+        distance = hypot(found.u_px - u, found.v_px - v)
         best = int(np.argmin(distance))
         # Four pixels: a fifth of the radius, well inside the matching rule; the network never saw such bowls.
         assert distance[best] < 4.0
@@ -76,17 +76,33 @@ def test_turning_the_frame_with_the_sun_turns_the_detections(detector):
     assert turned.v_px == approx(511.0 - reference.u_px, abs=1e-9)
 
 
-@mark.parametrize(
-    ("image", "verdict"),
-    [
-        (np.zeros((512, 512, 3), np.uint8), ImageQuality.DARK),
-        (np.zeros((511, 512, 3), np.uint8), ImageQuality.INVALID),
-        (np.zeros((512, 512, 7), np.uint8), ImageQuality.INVALID),
-        (np.full((512, 512), "x"), ImageQuality.INVALID),
-        (np.full((512, 512), -1, np.int16), ImageQuality.INVALID),
-    ],
-)
-def test_a_bad_frame_is_a_verdict_and_no_detections(detector, image, verdict):
+BAD = """DARK 512,512,3 uint8 0
+INVALID 511,512,3 uint8 0
+INVALID 512,512,7 uint8 0
+INVALID 512,512 U1 0
+INVALID 512,512 int16 -1"""
+UNSEARCHABLE = """DARK 512,512,3 uint8 0
+DARK 512,512,3 uint8 4
+SATURATED 512,512,3 uint8 255
+SATURATED 512,512 uint16 65535
+UNIFORM 512,512,3 uint8 120
+INVALID 512,512 float32 nan
+INVALID 512,512,2 uint8 0
+INVALID 0,0 uint8 0
+INVALID 512 uint8 0
+INVALID 512,512 complex64 0
+INVALID 2,2,2,2 uint8 0"""
+
+
+def verdict_of(row):
+    """Return the verdict of a row, and an image of its shape and type with one value."""
+    verdict, shape, kind, value = row.split()
+    return ImageQuality[verdict], np.full([*map(int, shape.split(","))], float(value)).astype(kind)
+
+
+@mark.parametrize("row", BAD.splitlines())
+def test_a_bad_frame_is_a_verdict_and_no_detections(detector, row):
+    verdict, image = verdict_of(row)
     quality, found = detector.examine(image)
     assert quality is verdict and len(found) == 0
 
@@ -98,7 +114,7 @@ def test_images_of_any_size_are_searched_in_tiles(detector):
     quality, found = detector.examine_any_size(large, np.array([0.0, -1.0, 0.2]))
     assert quality is ImageQuality.OK
     for u, v in CENTRES:
-        assert np.hypot(found.u_px - u - 700, found.v_px - v - 300).min() < 4.0
+        assert hypot(found.u_px - u - 700, found.v_px - v - 300).min() < 4.0
     small_quality, small = detector.examine_any_size(tile[:200, :300])
     assert small_quality is ImageQuality.OK
     assert (small.u_px < 300).all() and (small.v_px < 200).all()
@@ -132,8 +148,7 @@ def test_the_shipped_network_is_small_and_tells_what_it_is(detector):
     assert 0.1 <= detector.score_threshold <= 0.9
     for key in ("input", "outputs", "navigation_threshold", "data", "validation", "git_revision", "training_seed"):
         assert detector.metadata[key]
-    tested = json.loads(detector.metadata["test_figures"])
-    assert set(tested) == {"real-strip", "real-block", "procedural-world"}
+    assert set(json.loads(detector.metadata["test_figures"])) == {"real-strip", "real-block", "procedural-world"}
 
 
 def test_a_network_of_another_hash_and_octets_that_are_none_are_refused():
@@ -163,8 +178,7 @@ def maps(*count):
 
 
 def test_a_flat_heatmap_gives_no_detections():
-    found = decode(maps(), maps(4), 0.1)
-    assert len(found) == 0
+    assert len(decode(maps(), maps(4), 0.1)) == 0
 
 
 def detections(u, v, diameter=40.0, ratio=None):
@@ -208,8 +222,7 @@ def test_craters_on_the_very_edge_of_the_heatmap_are_decoded():
 def test_a_weaker_repetition_is_dropped_and_a_nested_crater_and_what_it_repeats_stay():
     columns = ([100, 104, 102], [100, 101, 100], [40, 44, 12], [0.9, 0.8, 0.7], [1, 1, 1])
     found = Detections(*(np.array(column, float) for column in columns))
-    kept = drop_duplicates(found, DetectorParameters())
-    assert kept.diameter_px.tolist() == [40, 12]
+    assert drop_duplicates(found, DetectorParameters()).diameter_px.tolist() == [40, 12]
     # The second repeats the first and goes; the third repeats only the second, so it is a crater of its own.
     found = detections([100, 108, 116], [100, 100, 100], diameter=30.0)
     assert drop_duplicates(found, DetectorParameters()).u_px.tolist() == [100, 116]
@@ -259,8 +272,7 @@ def test_a_picture_without_its_sun_gives_what_the_picture_with_it_gives(detector
     assert found.detections.u_px.tolist() == given.detections.u_px.tolist()
     assert found.detections.score.tolist() == given.detections.score.tolist()
     assert len(found.detections) >= len(BOWL_CENTRES)
-    straight = detector.examine_any_size(image, sun_at_azimuth(200.0))[1]
-    assert straight.v_px.tolist() == given.detections.v_px.tolist()
+    assert detector.examine_any_size(image, sun_at_azimuth(200.0))[1].v_px.tolist() == given.detections.v_px.tolist()
 
 
 def test_craters_of_two_opposite_suns_leave_it_undetermined(detector):
@@ -276,8 +288,7 @@ def test_a_slope_is_no_evidence_of_a_crater():
 
 
 def test_nothing_to_be_seen_gives_no_sun_and_a_dark_picture_is_a_verdict(detector):
-    noise = np.random.default_rng(3).integers(90, 110, (300, 400)).astype(np.uint8)
-    outcome = search_picture(detector, noise)
+    outcome = search_picture(detector, default_rng(3).integers(90, 110, (300, 400)).astype(np.uint8))
     assert outcome.quality is ImageQuality.OK
     assert outcome.sun is None
     outcome = search_picture(detector, np.zeros((64, 64), np.uint8))
@@ -291,14 +302,13 @@ def test_craters_of_eight_pixels_are_found_at_two_scales(detector):
 
     def found_share(outcome):
         found = outcome.detections
-        return np.mean([(np.hypot(found.u_px - u, found.v_px - v) < 2.5).any() for u, v in centres])
+        return np.mean([(hypot(found.u_px - u, found.v_px - v) < 2.5).any() for u, v in centres])
 
     one = search_picture(detector, image, sun_at_azimuth(0.0))
     two = search_picture(detector, image, sun_at_azimuth(0.0), two_scales=True)
     assert found_share(two) > 0.9
     assert found_share(one) < 0.3
-    near = two.detections.select(two.detections.score > 0.44)
-    assert np.median(near.diameter_px) == approx(8.0, rel=0.25)
+    assert np.median(two.detections.select(two.detections.score > 0.44).diameter_px) == approx(8.0, rel=0.25)
 
 
 def test_what_one_scale_finds_two_scales_find(detector):
@@ -322,7 +332,7 @@ def test_enlarging_puts_pixel_x_at_two_x_and_a_half():
 
 
 @mark.parametrize(
-    ("shape", "count"), [((512, 512), 4), ((351, 640), 4), ((200, 300), 2), ((100, 90), 1), ((2000, 3000), 4)]
+    "shape, count", [((512, 512), 4), ((351, 640), 4), ((200, 300), 2), ((100, 90), 1), ((2000, 3000), 4)]
 )
 def test_evidence_comes_from_up_to_four_squares(shape, count):
     squares = _squares(np.zeros(shape, np.float32))
@@ -331,9 +341,9 @@ def test_evidence_comes_from_up_to_four_squares(shape, count):
 
 
 def random_detections(count, seed, side):
-    rng = np.random.default_rng(seed)
+    rng = default_rng(seed)
     diameter = np.exp(rng.normal(3.0, 0.8, count))
-    diameter[:: max(1, count // 7)] = np.nan
+    diameter[:: max(1, count // 7)] = nan
     return Detections(
         rng.uniform(0, side, count), rng.uniform(0, side, count), diameter, np.sort(rng.uniform(0, 1, count))[::-1],
         np.ones(count)
@@ -346,8 +356,7 @@ def test_many_detections_lose_the_same_duplicates_as_few(monkeypatch, seed):
     each_with_each = drop_duplicates(found, DetectorParameters())
     assert len(each_with_each) < len(found)
     monkeypatch.setattr("payload_emulator.flight.vision.detector.MANY_DETECTIONS", 0)
-    by_neighbours = drop_duplicates(found, DetectorParameters())
-    assert by_neighbours.u_px.tolist() == each_with_each.u_px.tolist()
+    assert drop_duplicates(found, DetectorParameters()).u_px.tolist() == each_with_each.u_px.tolist()
 
 
 def test_memory_does_not_grow_with_the_square_of_the_detections():
@@ -357,8 +366,8 @@ def test_memory_does_not_grow_with_the_square_of_the_detections():
 
 
 def texture(shape=(512, 512, 3), dtype=np.uint8):
-    rng = np.random.default_rng(0)
-    smooth = 100 + 60 * np.sin(np.arange(shape[1]) / 9.0)[None, :] * np.cos(np.arange(shape[0]) / 7.0)[:, None]
+    rng = default_rng(0)
+    smooth = 100 + 60 * sin(np.arange(shape[1]) / 9.0)[None, :] * cos(np.arange(shape[0]) / 7.0)[:, None]
     image = smooth + rng.normal(0, 4, shape[:2])
     if len(shape) == 3:
         image = np.repeat(image[..., None], shape[2], axis=2)
@@ -385,7 +394,7 @@ def test_a_good_frame_has_zero_mean_and_unit_deviation_whatever_its_depth_and_co
 
 @mark.parametrize("shape", [(512, 512), (512, 512, 3), (300, 200, 4), (64, 64, 1)])
 def test_eight_bits_go_a_quicker_way_to_the_same_values(shape):
-    image = np.random.default_rng(1).integers(0, 256, shape, dtype=np.uint8)
+    image = default_rng(1).integers(0, 256, shape, dtype=np.uint8)
     colours = image if image.ndim == 2 else image[..., : 3 if shape[2] >= 3 else 1].mean(axis=2)
     # Rounding of 32-bit numbers up to 4 and the order of sums.
     assert prepare_image(image).gray == approx(prepare_image(colours / 255.0).gray, abs=5e-6)
@@ -397,23 +406,9 @@ def test_half_the_exposure_gives_the_same_input():
     assert np.abs(prepare_image(bright // 2).gray - reference).max() < 1e-3
 
 
-@mark.parametrize(
-    ("image", "verdict"),
-    [
-        (np.zeros((512, 512, 3), np.uint8), ImageQuality.DARK),
-        (np.full((512, 512, 3), 4, np.uint8), ImageQuality.DARK),
-        (np.full((512, 512, 3), 255, np.uint8), ImageQuality.SATURATED),
-        (np.full((512, 512), 65535, np.uint16), ImageQuality.SATURATED),
-        (np.full((512, 512, 3), 120, np.uint8), ImageQuality.UNIFORM),
-        (np.full((512, 512), np.nan, np.float32), ImageQuality.INVALID),
-        (np.zeros((512, 512, 2), np.uint8), ImageQuality.INVALID),
-        (np.zeros((0, 0), np.uint8), ImageQuality.INVALID),
-        (np.zeros(512, np.uint8), ImageQuality.INVALID),
-        (np.zeros((512, 512), np.complex64), ImageQuality.INVALID),
-        (np.zeros((2, 2, 2, 2), np.uint8), ImageQuality.INVALID),
-    ],
-)
-def test_a_frame_that_cannot_be_searched_is_a_verdict(image, verdict):
+@mark.parametrize("row", UNSEARCHABLE.splitlines())
+def test_a_frame_that_cannot_be_searched_is_a_verdict(row):
+    verdict, image = verdict_of(row)
     assert prepare_image(image).quality is verdict
 
 
@@ -425,14 +420,14 @@ def test_gray_levels_round_to_the_nearest_count_and_one_that_is_no_number_is_inv
     assert gray_levels(image).tolist() == [[1, 255, 0]]
 
 
-@given(st.floats(0.0, 2.0 * np.pi))
+@given(st.floats(0.0, 2.0 * pi))
 def test_after_the_turns_the_sun_is_within_45_degrees_of_the_top(azimuth):
-    sun = np.array([np.sin(azimuth), -np.cos(azimuth), 0.3])
+    sun = np.array([sin(azimuth), -cos(azimuth), 0.3])
     turns = sun_up_turns(sun)
     # Follow a point from the middle toward the Sun.
     u, v = turn_forward(np.array([255.5 + 100 * sun[0]]), np.array([255.5 + 100 * sun[1]]), turns, 512, 512)
-    assert 255.5 - v[0] >= 100 * np.cos(np.pi / 4) - 1e-6
-    assert abs(u[0] - 255.5) <= 100 * np.sin(np.pi / 4) + 1e-6
+    assert 255.5 - v[0] >= 100 * cos(pi / 4) - 1e-6
+    assert abs(u[0] - 255.5) <= 100 * sin(pi / 4) + 1e-6
 
 
 @mark.parametrize("turns", [0, 1, 2, 3])
@@ -447,6 +442,6 @@ def test_turned_coordinates_point_at_the_same_pixel_and_come_back(turns):
             assert (back_u[0], back_v[0]) == (column, row)
 
 
-@mark.parametrize("sun", [None, np.array([np.nan, np.nan, np.nan]), np.array([0.0, 0.0, 1.0])])
+@mark.parametrize("sun", [None, np.array([nan, nan, nan]), np.array([0.0, 0.0, 1.0])])
 def test_without_a_sun_direction_the_frame_stays_as_it_is(sun):
     assert sun_up_turns(sun) == 0

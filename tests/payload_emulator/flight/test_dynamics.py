@@ -1,6 +1,7 @@
 """The on-board orbit model against the library's integrator, and its transition matrix against differences."""
 
 import numpy as np
+from numpy import cos, diag, radians, sin
 from numpy.testing import assert_allclose
 from pytest import mark
 from scipy.spatial.transform import Rotation
@@ -35,7 +36,7 @@ def model(noise=None):
 
 def start_state():
     position, velocity = icrf_state_from_elements(
-        Elements(1_768_180.0, 0.006908, *np.radians([89.076, 3.164, 333.604, 8.882])),
+        Elements(1_768_180.0, 0.006908, *radians([89.076, 3.164, 333.604, 8.882])),
         float(tdb_s_from_utc_ns(EPOCH)),
         builtin_gravity().gm_m3_s2,
     )
@@ -52,8 +53,7 @@ def test_an_orbit_on_board_is_that_of_the_library_to_a_centimetre_and_ends_where
     assert_allclose(predicted.state[3:6], expected[3:], atol=1e-5)
     orbit, state = model(), start_state()
     there = orbit.propagate(state, START, START + 1_800 * 65_536)
-    back = orbit.propagate(there.state, START + 1_800 * 65_536, START)
-    assert_allclose(back.state[:6], state[:6], atol=1e-3)
+    assert_allclose(orbit.propagate(there.state, START + 1_800 * 65_536, START).state[:6], state[:6], atol=1e-3)
 
 
 @mark.parametrize("axis, step", [(0, 10.0), (2, 10.0), (4, 0.01), (6, 1e-6), (8, 1e-6)])
@@ -72,7 +72,7 @@ def test_white_acceleration_grows_velocity_variance_with_time():
     noise = ProcessNoise((1e-6, 1e-6, 1e-6), (1e-12, 1e-12, 1e-12), 900.0)
     predicted = model(noise).propagate(start_state(), START, START + 60 * 65_536)
     # Over a minute gravity gradient changes this by (60 s x 0.9e-3 rad/s)^2, three parts in a thousand.
-    assert_allclose(np.diag(predicted.noise)[3:6], 60.0 * 1e-6, rtol=0.01)
+    assert_allclose(diag(predicted.noise)[3:6], 60.0 * 1e-6, rtol=0.01)
 
 
 def test_outside_the_orientation_table_there_is_no_prediction():
@@ -99,13 +99,12 @@ POLAR_M_S = np.array([0.0, 0.0, 1_665.0])
 
 
 def test_noise_falls_with_altitude_and_differs_by_side():
-    noise = ProcessNoise((4e-7, 2e-7, 1e-7), (1e-12,) * 3, 900.0, (9e-7, 9e-7, 9e-7), 8_000.0, 30_000.0)
-    orbit = model(noise)
+    orbit = model(ProcessNoise((4e-7, 2e-7, 1e-7), (1e-12,) * 3, 900.0, (9e-7, 9e-7, 9e-7), 8_000.0, 30_000.0))
 
     def density(altitude_m, longitude_deg):
         radius = 1_737_400.0 + altitude_m
-        longitude = np.radians(longitude_deg)
-        return orbit._white_psd(radius * np.array([np.cos(longitude), np.sin(longitude), 0.0]), POLAR_M_S)
+        longitude = radians(longitude_deg)
+        return orbit._white_psd(radius * np.array([cos(longitude), sin(longitude), 0.0]), POLAR_M_S)
 
     assert_allclose(density(30_000.0, 20.0), [4e-7, 2e-7, 1e-7], rtol=1e-9)
     assert_allclose(density(38_000.0, 20.0), np.array([4e-7, 2e-7, 1e-7]) / np.e, rtol=1e-9)
@@ -123,14 +122,13 @@ def test_noise_over_the_far_side_grows_with_the_cosine_of_the_inclination(inclin
     noise = ProcessNoise(
         (4e-7, 2e-7, 1e-7), far_side_psd_m2_s3=(3e-6, 2e-6, 1e-6), far_side_oblique_psd_m2_s3=(8e-6, 0.0, 6e-6)
     )
-    inclination = np.radians(inclination_deg)
+    inclination = radians(inclination_deg)
     # Over 180 degrees of longitude on the equator, going up: east is -y there.
-    velocity = 1_665.0 * np.array([0.0, -np.cos(inclination), np.sin(inclination)])
-    share = abs(np.cos(inclination))
+    velocity = 1_665.0 * np.array([0.0, -cos(inclination), sin(inclination)])
+    share = abs(cos(inclination))
     found = model(noise)._white_psd(np.array([-1_768e3, 0.0, 0.0]), velocity)
     assert_allclose(found, [3e-6 + share * 8e-6, 2e-6, 1e-6 + share * 6e-6], rtol=1e-9)
-    near = model(noise)._white_psd(np.array([1_768e3, 0.0, 0.0]), velocity)
-    assert near == (4e-7, 2e-7, 1e-7)
+    assert model(noise)._white_psd(np.array([1_768e3, 0.0, 0.0]), velocity) == (4e-7, 2e-7, 1e-7)
 
 
 def test_the_noise_that_the_filter_adds_is_that_of_its_inclination():
@@ -139,12 +137,12 @@ def test_the_noise_that_the_filter_adds_is_that_of_its_inclination():
     )  # fmt: skip
     added = []
     for inclination_deg in (90.0, 60.0):
-        inclination = np.radians(inclination_deg)
+        inclination = radians(inclination_deg)
         rotation = model().mcmf_from_icrf(START)
-        velocity = 1_665.0 * np.array([0.0, -np.cos(inclination), np.sin(inclination)])
+        velocity = 1_665.0 * np.array([0.0, -cos(inclination), sin(inclination)])
         state = np.concatenate([rotation.T @ [-1_768e3, 0.0, 0.0], rotation.T @ velocity, np.zeros(3)])
         predicted = model(noise).propagate(state, START, START + 60 * 65_536)
-        added.append(np.diag(predicted.noise)[3:6])
+        added.append(diag(predicted.noise)[3:6])
     # Half of 2e-6 for a minute at 60 degrees, nothing on a polar orbit.
     assert_allclose(added[1], 60.0 * 1e-6, rtol=0.01)
     assert_allclose(added[0], 0.0, atol=60.0 * 1e-8)

@@ -88,7 +88,7 @@ def test_an_inference_library_that_throws_costs_frames_not_the_payload(observing
 
 
 @mark.parametrize(
-    ("region", "event"), [(MODEL_NUMBER, "model_hash_mismatch"), (PARAMETERS_NUMBER, "parameters_hash_mismatch")]
+    "region, event", [(MODEL_NUMBER, "model_hash_mismatch"), (PARAMETERS_NUMBER, "parameters_hash_mismatch")]
 )
 def test_flipped_bits_in_memory_are_found_reported_and_restored(observing, region, event):
     observing.board.memory[region][1] ^= 0x08
@@ -101,7 +101,7 @@ def test_flipped_bits_in_memory_are_found_reported_and_restored(observing, regio
 
 
 @mark.parametrize(
-    ("table", "event"),
+    "table, event",
     [
         ("catalogue", "catalogue_hash_mismatch"),
         ("anchor_ephemeris", "anchor_table_hash_mismatch"),
@@ -210,8 +210,7 @@ def test_packets_damaged_in_the_store_are_found_reported_and_never_sent(observin
 def test_a_clock_that_jumps_is_reported_and_housekeeping_begins_again(observing, jump_s):
     observing.skew_ticks += round(jump_s * 65_536)
     packets = observing.step()
-    jumps = [v["value_1"] for v in observing.named(packets, "event_medium")]
-    assert jumps == [approx(jump_s, abs=1e-3)]
+    assert [v["value_1"] for v in observing.named(packets, "event_medium")] == [approx(jump_s, abs=1e-3)]
     assert observing.named(packets, "housekeeping")[0]["clock_status"] == 2
     assert len(observing.named(observing.step(), "detections")) == 1
 
@@ -230,14 +229,17 @@ def test_a_clock_that_jumps_ahead_does_not_release_what_it_has_passed(rig):
     assert not rig.named(packets, "connection_report")
 
 
-@mark.parametrize(
-    ("heat_c", "drop_v", "event", "safe"),
-    [
-        (52.0, 0.0, "temperature_high", False), (90.0, 0.0, "temperature_high", True),
-        (-50.0, 0.0, "temperature_low", False), (0.0, 2.3, "power_low", False), (0.0, 3.5, "power_low", True)
-    ]
-)  # fmt: skip
-def test_power_and_heat_out_of_limits_are_reported_once_and_end_in_safe_beyond(observing, heat_c, drop_v, event, safe):
+LIMITS = """52 0 temperature_high
+90 0 temperature_high safe
+-50 0 temperature_low
+0 2.3 power_low
+0 3.5 power_low safe"""
+
+
+@mark.parametrize("row", LIMITS.splitlines())
+def test_power_and_heat_out_of_limits_are_reported_once_and_end_in_safe_beyond(observing, row):
+    heat, drop, event, *beyond = row.split()
+    heat_c, drop_v, safe = float(heat), float(drop), bool(beyond)
     observing.board.heat_c, observing.board.drop_v = heat_c, drop_v
     packets = steps(observing, 6)
     assert observing.events(packets).count(event) == 1

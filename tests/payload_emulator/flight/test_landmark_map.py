@@ -3,7 +3,9 @@
 from dataclasses import replace
 
 import numpy as np
+from numpy import diag, eye, nan
 from numpy.linalg import eigvalsh, norm
+from numpy.random import default_rng
 from pytest import approx
 
 from lunar.camera import PinholeCamera, nadir_camera_from_mcmf
@@ -34,7 +36,7 @@ SPACECRAFT_M = 100.0
 
 
 def ground(count, seed):
-    rng = np.random.default_rng(seed)
+    rng = default_rng(seed)
     latitude, longitude = rng.uniform(-0.02, 0.09, count), rng.uniform(-0.02, 0.02, count)
     return mcmf_from_spherical(latitude, longitude, 300.0 + 400.0 * rng.standard_normal(count))
 
@@ -65,7 +67,7 @@ def offset_m(landmark, craters, shift_m=0.0):
 
 def fly(mapper, craters, seed, frames=6, start_ticks=0, east_m=0.0, false=0, error_m=(0.0, 0.0, 0.0)):
     """One pass to the north at 30 km, believed to be `error_m` from where it is."""
-    rng = np.random.default_rng(seed)
+    rng = default_rng(seed)
 
     made = []
     for k in range(frames):
@@ -80,7 +82,7 @@ def fly(mapper, craters, seed, frames=6, start_ticks=0, east_m=0.0, false=0, err
         uv = np.concatenate([uv, rng.uniform(0.0, 511.0, (false, 2))])
         size = np.concatenate([size, np.full(false, 25.0)])
         found = Detections(uv[:, 0], uv[:, 1], size, np.ones(len(uv)), np.full(len(uv), SIGMA_PX))
-        view = View(start_ticks + k * 15 * SECOND, rotation, place + error_m, SPACECRAFT_M**2 * np.eye(3), 1e-4)
+        view = View(start_ticks + k * 15 * SECOND, rotation, place + error_m, SPACECRAFT_M**2 * eye(3), 1e-4)
         free = np.ones(len(uv), bool)
         made += mapper.observe(view, found, np.full(len(uv), SIGMA_PX**2), free, 300.0)
     made += mapper.close()
@@ -95,7 +97,7 @@ def test_craters_become_landmarks_where_they_are_and_with_errors_as_claimed():
     errors, nees = [], []
     for landmark in made:
         offset = offset_m(landmark, craters)
-        own = landmark.covariance_m2 - SPACECRAFT_M**2 * np.eye(3)
+        own = landmark.covariance_m2 - SPACECRAFT_M**2 * eye(3)
         errors.append(float(norm(offset)))
         nees.append(float(offset @ np.linalg.solve(own, offset)))
     # One pixel at 30 km is 203 m; three sightings under wide parallax place a crater to about that.
@@ -139,17 +141,16 @@ def test_a_second_pass_joins_the_landmarks_of_the_first_without_counting_its_err
 
 
 def test_the_intersection_never_claims_more_than_the_better_of_two_equal_directions():
-    covariance = np.diag([100.0, 400.0, 900.0])
+    covariance = diag([100.0, 400.0, 900.0])
     first = Landmark(FIRST_LANDMARK_ID, np.zeros(3), covariance, 5e3, 3, 1, 0)
     second = replace(first, position_mcmf_m=np.array([1.0, 2.0, 3.0]))
     joined = intersected(first, second)
     assert np.allclose(joined.covariance_m2, covariance)
     assert (joined.sightings, joined.passes) == (6, 2)
-    turned = replace(second, covariance_m2=np.diag([900.0, 400.0, 100.0]))
-    other = intersected(first, turned)
+    other = intersected(first, replace(second, covariance_m2=diag([900.0, 400.0, 100.0])))
     assert np.trace(other.covariance_m2) <= np.trace(covariance)
     # Julier and Uhlmann: for diag(100, 900) and diag(900, 100) the half and half mixture gives 2/(1/100+1/900) = 180.
-    assert np.diag(other.covariance_m2)[[0, 2]] == approx([180.0, 180.0])
+    assert diag(other.covariance_m2)[[0, 2]] == approx([180.0, 180.0])
 
 
 def test_memory_is_bounded():
@@ -161,8 +162,7 @@ def test_memory_is_bounded():
 
 def test_landmarks_complement_the_catalogue_with_identities_of_their_own():
     mapper = Mapper()
-    craters = ground(25, 1)
-    fly(mapper, craters, 2)
+    fly(mapper, ground(25, 1), 2)
     one = np.ones(1)
     catalogue = CatalogueTable(np.array([7]), 0.1 * one, 0.2 * one, 6e3 * one, 50.0 * one, 80.0 * np.ones((1, 3)))
     merged = with_catalogue(mapper.state.landmarks, catalogue)
@@ -176,13 +176,12 @@ def test_landmarks_complement_the_catalogue_with_identities_of_their_own():
 
 
 def test_nothing_is_mapped_while_the_spacecraft_does_not_know_where_it_is_or_sees_nothing():
-    mapper = Mapper(position_limit_m=50.0)
-    assert fly(mapper, ground(25, 1), 2) == []
+    assert fly(Mapper(position_limit_m=50.0), ground(25, 1), 2) == []
     nothing = no_detections()
     place = mcmf_from_spherical(0.0, 0.0, 30e3)
-    view = View(0, nadir_camera_from_mcmf(place), place, np.eye(3), 1e-4)
+    view = View(0, nadir_camera_from_mcmf(place), place, eye(3), 1e-4)
     assert Mapper().observe(view, nothing, np.empty(0), np.empty(0, bool), 0.0) == ()
-    lost = replace(view, covariance_m2=np.full((3, 3), np.nan))
+    lost = replace(view, covariance_m2=np.full((3, 3), nan))
     one = np.ones(1)
     found = Detections(200.0 * one, 200.0 * one, 20.0 * one, one, one)
     assert Mapper().observe(lost, found, one, np.ones(1, bool), 0.0) == ()
@@ -191,10 +190,9 @@ def test_nothing_is_mapped_while_the_spacecraft_does_not_know_where_it_is_or_see
 def test_detections_that_are_no_numbers_or_on_a_catalogued_crater_are_not_free():
     mapper = Mapper()
     place = mcmf_from_spherical(0.0, 0.0, 30e3)
-    view = View(0, nadir_camera_from_mcmf(place), place, np.eye(3), 1e-4)
-    values = np.array([np.nan, 200.0, 300.0])
-    size = np.array([20.0, np.nan, 25.0])
-    found = Detections(values, values, size, np.ones(3), np.ones(3))
+    view = View(0, nadir_camera_from_mcmf(place), place, eye(3), 1e-4)
+    values = np.array([nan, 200.0, 300.0])
+    found = Detections(values, values, np.array([20.0, nan, 25.0]), np.ones(3), np.ones(3))
     for k in range(4):
         mapper.observe(replace(view, ticks=k * SECOND), found, np.ones(3), np.ones(3, bool), 0.0)
     assert len(mapper.close()) == 1

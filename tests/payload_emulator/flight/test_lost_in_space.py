@@ -8,6 +8,7 @@ from math import exp, nan, radians, sin, sqrt, tan
 import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from numpy import cos, degrees, eye, log, pi
 from numpy.linalg import norm
 from numpy.random import default_rng
 from numpy.testing import assert_allclose, assert_array_equal
@@ -60,7 +61,7 @@ def craters(west_deg=350.0, seed=1):
     latitude = np.arcsin(rng.uniform(-1.0, 1.0, count) * sin(radians(20.0)))
     longitude = np.radians(west_deg + rng.uniform(0.0, 20.0, count))
     diameter = 5e3 * (1.0 - rng.uniform(size=count) * (1.0 - 6.0**-1.77)) ** (-1.0 / 1.77)
-    height = 1_500.0 * np.sin(8.0 * longitude) * np.cos(6.0 * latitude)
+    height = 1_500.0 * np.sin(8.0 * longitude) * cos(6.0 * latitude)
     sigma = np.full((count, 3), 80.0)
     return landmark_map(CatalogueTable(np.arange(count), latitude, longitude, diameter, height, sigma))
 
@@ -127,8 +128,7 @@ def test_false_detections_mirrored_and_turned_images_find_no_place(index):
 
 
 def test_a_place_off_the_map_few_detections_and_those_that_are_no_numbers_are_no_fix(index):
-    other = craters(west_deg=100.0, seed=8)
-    _, found = frame(other, 0.0, 110.0, 30e3, seed=2)
+    _, found = frame(craters(west_deg=100.0, seed=8), 0.0, 110.0, 30e3, seed=2)
     assert searched(found, index) is None
     assert searched(no_detections(), index) is None
     _, found = frame(index.landmarks, 3.0, 359.7, 30e3, seed=5)
@@ -164,15 +164,15 @@ def test_craters_are_sorted_by_tile_height_and_diameter(west_deg):
     tiles = []
     for first, stop in pairwise(index.tile_start):
         low, high = index.bin_start[first], index.bin_start[stop]
-        longitude = np.degrees(index.longitude_rad[low:high]) % 360.0
-        places = np.stack([np.degrees(index.latitude_rad[low:high]) // 15.0, longitude // 15.0])
+        longitude = degrees(index.longitude_rad[low:high]) % 360.0
+        places = np.stack([degrees(index.latitude_rad[low:high]) // 15.0, longitude // 15.0])
         assert np.all(places == places[:, :1])
         tiles.append(tuple(places[:, 0]))
         assert np.all(np.diff(index.bin_height[first:stop]) > 0)
     assert len(set(tiles)) == len(tiles) > 4
     for first, stop in pairwise(index.bin_start):
         assert stop > first and np.all(np.diff(index.log_diameter[first:stop]) >= 0.0)
-    assert_array_equal(np.sort(index.log_diameter), np.sort(np.log(landmarks.diameter_m)))
+    assert_array_equal(np.sort(index.log_diameter), np.sort(log(landmarks.diameter_m)))
 
 
 def test_a_map_without_craters_has_an_index_and_gives_no_fix():
@@ -208,11 +208,10 @@ def test_what_a_search_left_in_memory_does_not_change_the_next(index):
 @mark.parametrize("beyond_deg", [-0.9, 0.9])
 def test_a_camera_beyond_the_last_craters_is_found(beyond_deg, index):
     """It is over rows of the vote that belong to no tile of the map."""
-    latitude = np.degrees(index.landmarks.latitude_rad)
+    latitude = degrees(index.landmarks.latitude_rad)
     edge = latitude.min() if beyond_deg < 0.0 else latitude.max()
     place, found = frame(index.landmarks, edge + beyond_deg, 1.0, 45e3, seed=3, recall=0.9, false=1)
-    result = searched(found, index)
-    assert norm(result.position_mcmf_m - place) < 2_000.0
+    assert norm(searched(found, index).position_mcmf_m - place) < 2_000.0
 
 
 IMAGE = Image(100.0, np.array([50.0, 50.0]), np.array([50.0, 50.0]))
@@ -221,9 +220,9 @@ PREDICTED_PX = np.array([[20.0, 20.0], [80.0, 30.0], [40.0, 70.0], [75.0, 80.0]]
 
 def evidence_of(uv_px, diameter_px, pairs, score=None):
     """Return the evidence of detections for four craters of 8 to 64 px predicted in an image of 100 by 100."""
-    seen = Seen(PREDICTED_PX, np.log([8.0, 16.0, 32.0, 64.0]), np.zeros((4, 3)), np.zeros(4))
+    seen = Seen(PREDICTED_PX, log([8.0, 16.0, 32.0, 64.0]), np.zeros((4, 3)), np.zeros(4))
     score = np.full(len(uv_px), 0.5) if score is None else score
-    found = DetectedCraters(uv_px, np.log(diameter_px), np.full(len(uv_px), 3.0**2), score)
+    found = DetectedCraters(uv_px, log(diameter_px), np.full(len(uv_px), 3.0**2), score)
     return log_evidence(np.array(pairs), seen, found, IMAGE, 0.1)
 
 
@@ -269,10 +268,10 @@ def test_detections_without_scores_are_searched(index):
 
 
 def test_the_same_detections_vote_at_all_altitudes_within_the_bound_of_work(index):
-    log_size = np.log(np.linspace(0.9, 0.1, 40))
+    log_size = log(np.linspace(0.9, 0.1, 40))
     altitudes, cells = np.geomspace(12e3, 55e3, 20), np.full(20, 2e-4)
-    size = np.sort(np.log(index.landmarks.diameter_m))
-    wanted = log_size[:, None] + np.log(altitudes)
+    size = np.sort(log(index.landmarks.diameter_m))
+    wanted = log_size[:, None] + log(altitudes)
     gate = RULES.log_diameter_gate
     pairs = (np.searchsorted(size, wanted + gate) - np.searchsorted(size, wanted - gate)).sum(axis=1)
     for share in (0.3, 0.7):
@@ -302,9 +301,9 @@ def small_anchor(moon):
 
 
 def catalogue_table(count=50):
-    rng = np.random.default_rng(2)
+    rng = default_rng(2)
     return CatalogueTable(
-        np.arange(count) + 7, rng.uniform(-1.0, 1.0, count), rng.uniform(0.0, 2.0 * np.pi, count),
+        np.arange(count) + 7, rng.uniform(-1.0, 1.0, count), rng.uniform(0.0, 2.0 * pi, count),
         rng.uniform(3e3, 30e3, count), rng.uniform(-8e3, 8e3, count), rng.uniform(20.0, 900.0, (count, 3))
     )  # fmt: skip
 
@@ -329,7 +328,7 @@ def test_an_anchor_table_interpolates_to_a_millimetre_within_its_span_and_knows_
         assert table.altitude_m(moon.ticks_at(second)) == approx(altitude, abs=0.1)
     seconds = np.arange(0.0, 6_600.0, 60.0)
     table = unpack_anchor_table(moon.anchor(seconds))
-    z = moon.orbit(seconds)[:, 2] / np.linalg.norm(moon.orbit(seconds), axis=1)
+    z = moon.orbit(seconds)[:, 2] / norm(moon.orbit(seconds), axis=1)
     for k in range(2, seconds.size - 2, 7):
         if abs(z[k]) < 0.95:
             sample = table.at(moon.ticks_at(seconds[k]))
@@ -355,7 +354,7 @@ def test_a_catalogue_table_comes_back_within_its_quantisation(moon):
 def test_longitudes_on_either_side_of_the_meridian_survive_packing():
     table = catalogue_table(3)
     near = CatalogueTable(
-        table.ids, table.latitude_rad, np.array([-1e-12, 2 * np.pi - 1e-12, -3.0]), table.diameter_m,
+        table.ids, table.latitude_rad, np.array([-1e-12, 2 * pi - 1e-12, -3.0]), table.diameter_m,
         table.rim_height_m, table.sigma_m
     )  # fmt: skip
     back = unpack_catalogue_table(pack_catalogue_table(near))
@@ -364,10 +363,9 @@ def test_longitudes_on_either_side_of_the_meridian_survive_packing():
 
 
 def test_gravity_orientation_and_initial_state_come_back_exactly():
-    rng = np.random.default_rng(3)
+    rng = default_rng(3)
     lower = np.tril(rng.normal(size=(9, 9)))
-    gravity = GravityTable("TEST8", 4.9e12, 1.738e6, lower, 2.0 * lower)
-    again = unpack_gravity_table(pack_gravity_table(gravity))
+    again = unpack_gravity_table(pack_gravity_table(GravityTable("TEST8", 4.9e12, 1.738e6, lower, 2.0 * lower)))
     assert (again.name, again.gm_m3_s2, again.radius_m) == ("TEST8", 4.9e12, 1.738e6)
     assert_array_equal(again.c_bar, lower)
     assert_array_equal(again.s_bar, 2.0 * lower)
@@ -382,17 +380,15 @@ def test_an_orientation_table_of_two_hour_steps_is_a_rotation_good_to_a_millimet
     def matrix(second):
         # A turning Moon with a physical libration of 0.01 rad and 27 days: rates as large as the real ones.
         w, tilt = 2.6617e-6 * second, 0.4 + 1e-2 * np.sin(2.6617e-6 * second)
-        rz = np.array([[np.cos(w), np.sin(w), 0], [-np.sin(w), np.cos(w), 0], [0, 0, 1]])
-        rx = np.array([[1, 0, 0], [0, np.cos(tilt), np.sin(tilt)], [0, -np.sin(tilt), np.cos(tilt)]])
-        return rz @ rx
+        rz = np.array([[cos(w), np.sin(w), 0], [-np.sin(w), cos(w), 0], [0, 0, 1]])
+        return rz @ np.array([[1, 0, 0], [0, cos(tilt), np.sin(tilt)], [0, -np.sin(tilt), cos(tilt)]])
 
     seconds = np.arange(-36_000.0, 122_400.0, 7_200.0)
     ticks = np.round(seconds * 65_536).astype(int)
-    octets = pack_orientation_table(ticks, [matrix(second) for second in seconds], np.eye(3))
-    table = unpack_orientation_table(octets)
+    table = unpack_orientation_table(pack_orientation_table(ticks, [matrix(second) for second in seconds], eye(3)))
     for second in (0.0, 1_234.0, 50_000.0):
         found = table.at(round(second * 65_536))
-        assert_allclose(found @ found.T, np.eye(3), atol=1e-14)
+        assert_allclose(found @ found.T, eye(3), atol=1e-14)
         assert_allclose(found * 1.7374e6, matrix(second) * 1.7374e6, atol=1e-3)
     assert table.at(int(ticks[-1]) + 1) is None
 
@@ -403,7 +399,7 @@ def all_tables(moon):
         (small_anchor(moon), unpack_anchor_table),
         (pack_catalogue_table(catalogue_table()), unpack_catalogue_table),
         (pack_gravity_table(GravityTable("X", 1.0, 1.0, lower, lower)), unpack_gravity_table),
-        (pack_orientation_table([0, 10, 20], np.stack([np.eye(3)] * 3), np.eye(3)), unpack_orientation_table),
+        (pack_orientation_table([0, 10, 20], np.stack([eye(3)] * 3), eye(3)), unpack_orientation_table),
         (pack_initial_state(InitialState(0, np.ones(3), np.ones(3), 1.0, 1.0)), unpack_initial_state),
     ]
 

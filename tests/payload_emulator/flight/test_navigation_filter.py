@@ -9,6 +9,7 @@ import math
 from dataclasses import replace
 
 import numpy as np
+from numpy import diag, exp, eye, nan, sqrt
 from numpy.linalg import eigvalsh, norm
 from numpy.random import default_rng
 from numpy.testing import assert_allclose, assert_array_equal
@@ -79,7 +80,7 @@ def prior_state(index):
     rng = default_rng(5)
     sizes = [60.0, 0.08, 2e-6, 2e-4, 0.25, 15.0, 12.0, 10.0, 5e-4, 60.0]
     sigma = np.repeat(sizes, [3, 3, 3, 3, 2, 1, 1, 1, 1, 3 * index.size])
-    root = np.eye(sigma.size) + 0.15 * rng.standard_normal((sigma.size, sigma.size))
+    root = eye(sigma.size) + 0.15 * rng.standard_normal((sigma.size, sigma.size))
     covariance = (root @ root.T) * sigma[:, None] * sigma[None]
     mean = np.zeros(sigma.size)
     mean[:3], mean[3:6], mean[17] = POSITION_ICRF, [10.0, 1_600.0, -50.0], 2e-4
@@ -112,7 +113,7 @@ def dense_update(prior, landmarks, index, uv, variance):
     mean0 = np.concatenate([prior.mean, np.zeros(3)])
     covariance0 = np.zeros((size + 3, size + 3))
     covariance0[:size, :size] = prior.covariance
-    covariance0[size:, size:] = np.eye(3) * ERRORS.attitude_noise_rad**2
+    covariance0[size:, size:] = eye(3) * ERRORS.attitude_noise_rad**2
     information, weight = np.linalg.inv(covariance0), np.repeat(1.0 / variance, 2)
     steps = differences(size)
 
@@ -134,13 +135,13 @@ def dense_update(prior, landmarks, index, uv, variance):
         right = h.T @ (weight * (uv.reshape(-1) - measure(x))) - information @ (x - mean0)
         x = x + np.linalg.solve(normal, right)
     covariance = np.linalg.inv(normal)
-    spread = first @ covariance0 @ first.T + np.diag(1.0 / weight)
+    spread = first @ covariance0 @ first.T + diag(1.0 / weight)
     innovation = uv.reshape(-1) - measure(mean0)
     nis = float(innovation @ np.linalg.inv(spread) @ innovation)
     summed = innovation.reshape(-1, 2).sum(axis=0)
     rows = np.arange(innovation.size).reshape(-1, 2)
     scatter = np.array([spread[np.ix_(rows[:, a], rows[:, a])].sum() for a in (0, 1)])
-    return x, covariance, nis, summed / np.sqrt(scatter)
+    return x, covariance, nis, summed / sqrt(scatter)
 
 
 def test_an_update_is_the_least_squares_solution_with_its_covariance():
@@ -151,11 +152,11 @@ def test_an_update_is_the_least_squares_solution_with_its_covariance():
     truth[:3] += [30.0, -20.0, 25.0]
     variance = np.array([0.6, 1.1, 0.3, 2.0, 0.8])
     turn = np.array([3e-4, -2e-4, 4e-4])
-    uv = projected(truth, landmarks, index, turn) + np.sqrt(variance)[:, None] * rng.standard_normal((5, 2))
+    uv = projected(truth, landmarks, index, turn) + sqrt(variance)[:, None] * rng.standard_normal((5, 2))
     found = updated(prior, landmarks, index, uv, variance, ERRORS, 6)
     mean, covariance, nis, mean_innovation = dense_update(prior, landmarks, index, uv, variance)
     size = prior.mean.size
-    sigma = np.sqrt(np.diag(covariance))
+    sigma = sqrt(diag(covariance))
     # Iteration ends within centimetres; covariances are taken at the last point of linearisation.
     assert np.max(np.abs(found.state.mean - mean[:size]) / sigma[:size]) < 2e-3
     assert_allclose(found.attitude_rad, mean[size:], atol=2e-3 * sigma[-1])
@@ -167,21 +168,20 @@ def test_an_update_is_the_least_squares_solution_with_its_covariance():
     assert_allclose(found.residual_px, residual, atol=2e-3)
     total = covariance[9:12, 9:12] + covariance[size:, size:]
     total = total + covariance[9:12, size:] + covariance[size:, 9:12]
-    assert found.attitude_sigma_rad == approx(np.sqrt(eigvalsh(total)[-1]), rel=1e-3)
+    assert found.attitude_sigma_rad == approx(sqrt(eigvalsh(total)[-1]), rel=1e-3)
     assert found.state.craters.tolist() == index.tolist()
     assert found.state.ticks == prior.ticks
     # Each sighting against the update with the others alone: its own variance is as good as infinite there.
     for k in range(index.size):
-        alone = np.where(np.arange(index.size) == k, 1e12, variance)
-        x, p, _, _ = dense_update(prior, landmarks, index, uv, alone)
+        x, p, _, _ = dense_update(prior, landmarks, index, uv, np.where(np.arange(index.size) == k, 1e12, variance))
         design = np.empty((2, x.size))
         for column in range(x.size):
-            width = np.sqrt(p[column, column]) * 0.1
-            change = np.eye(x.size)[column] * width
+            width = sqrt(p[column, column]) * 0.1
+            change = eye(x.size)[column] * width
             ends = [projected(y[:size], landmarks, index, y[size:])[k] for y in (x + change, x - change)]
             design[:, column] = (ends[0] - ends[1]) / (2.0 * width)
         off = uv[k] - projected(x[:size], landmarks, index, x[size:])[k]
-        expected = off @ np.linalg.solve(design @ p @ design.T + variance[k] * np.eye(2), off)
+        expected = off @ np.linalg.solve(design @ p @ design.T + variance[k] * eye(2), off)
         assert found.contradiction[k] == approx(expected, rel=0.02)
     # A rotation of the camera: gradient and information of the innovations.
     errors = replace(ERRORS, attitude_noise_rad=1e-3 * ERRORS.attitude_noise_rad)
@@ -198,7 +198,7 @@ def test_what_all_craters_share_is_distinguished_from_the_position_by_its_prior_
     errors = replace(ERRORS, attitude_noise_rad=1e-9, catalogue_offset_m=(30.0, 1e-3, 1e-3))
     start = first_state(40.0, errors=replace(errors, attitude_bias_rad=1e-9))
     covariance = start.covariance.copy()
-    covariance[12:14, 12:14], covariance[17, 17] = np.eye(2) * 1e-12, 1e-16
+    covariance[12:14, 12:14], covariance[17, 17] = eye(2) * 1e-12, 1e-16
     prior = replace(start, covariance=covariance).with_craters(index, np.full((40, 3), 1e-3))
     shifted = replace(prior, mean=prior.mean.copy())
     shifted.mean[14] = 100.0
@@ -211,7 +211,7 @@ def test_what_all_craters_share_is_distinguished_from_the_position_by_its_prior_
     east = MCMF_FROM_ICRF @ (found.state.mean[:3] - POSITION_ICRF)
     assert east[1] == approx(-64.0, abs=1.0)
     # What stays unknown is their common part: 1 / (1/30^2 + 1/40^2).
-    assert np.sqrt(found.state.covariance[14, 14]) == approx(24.0, abs=0.5)
+    assert sqrt(found.state.covariance[14, 14]) == approx(24.0, abs=0.5)
     moved = MCMF_FROM_ICRF @ found.state.covariance[:3, 14]
     assert moved[1] / found.state.covariance[14, 14] == approx(1.0, abs=0.02)
 
@@ -219,11 +219,10 @@ def test_what_all_craters_share_is_distinguished_from_the_position_by_its_prior_
 def test_craters_seen_where_they_are_predicted_move_nothing_and_tell_much():
     landmarks, index = craters(), np.arange(7)
     prior = prior_state(index)
-    uv = projected(prior.mean, landmarks, index, np.zeros(3))
-    found = updated(prior, landmarks, index, uv, np.full(7, 0.5))
+    found = updated(prior, landmarks, index, projected(prior.mean, landmarks, index, np.zeros(3)), np.full(7, 0.5))
     assert_allclose(found.state.mean, prior.mean, atol=1e-5)
     assert found.nis == approx(0.0, abs=1e-9)
-    assert np.all(np.diag(found.state.covariance) <= np.diag(prior.covariance) * (1.0 + 1e-9))
+    assert np.all(diag(found.state.covariance) <= diag(prior.covariance) * (1.0 + 1e-9))
 
 
 def test_numbers_that_allow_no_update_give_none():
@@ -233,7 +232,7 @@ def test_numbers_that_allow_no_update_give_none():
     behind.mean[:3] *= 0.9
     uv, variance = np.full((2, 2), 250.0), np.ones(2)
     assert updated(behind, landmarks, index, uv, variance) is None
-    assert updated(prior, landmarks, index, np.nan * uv, variance) is None
+    assert updated(prior, landmarks, index, nan * uv, variance) is None
 
 
 def test_derivatives_stand_in_the_columns_of_their_states():
@@ -249,8 +248,7 @@ def test_derivatives_stand_in_the_columns_of_their_states():
     assert design.shape == (3, 2, size)
 
     def measured(x):
-        full = np.concatenate([x[:18], x[21:24], x[18:21], x[14:17]])
-        return projected(full, landmarks, asked, x[24:])
+        return projected(np.concatenate([x[:18], x[21:24], x[18:21], x[14:17]]), landmarks, asked, x[24:])
 
     steps = differences(24)
     for k in range(size):
@@ -267,7 +265,7 @@ class Drift:
 
     def __init__(self):
         rng = default_rng(0)
-        self.transition = np.eye(9) + 0.1 * rng.standard_normal((9, 9))
+        self.transition = eye(9) + 0.1 * rng.standard_normal((9, 9))
         root = rng.standard_normal((9, 9))
         self.noise = 1e-3 * root @ root.T
 
@@ -281,26 +279,25 @@ def test_a_prediction_carries_each_part_by_its_own_law():
     prior, model = prior_state(np.array([2, 0])), Drift()
     found = kalman.predict(prior, 1_300 * SECOND, model, ERRORS)
     # 300 s at memories of 1000 s and 500 s.
-    tilt, shift = np.exp(-0.3), np.exp(-0.6)
-    transition = np.eye(24)
+    tilt, shift = exp(-0.3), exp(-0.6)
+    transition = eye(24)
     transition[:9, :9] = model.transition
-    transition[9:12, 9:12] = tilt * np.eye(3)
-    transition[12:14, 12:14] = shift * np.eye(2)
+    transition[9:12, 9:12] = tilt * eye(3)
+    transition[12:14, 12:14] = shift * eye(2)
     # What the registration leaves is lost with the angle flown, at a memory of 30 degrees.
     there = model.propagate(prior.mean[:9], prior.ticks, 1_300 * SECOND).state[:3]
     here = prior.mean[:3]
-    angle = np.arccos(here @ there / norm(here) / norm(there))
-    place = np.exp(-angle / np.radians(30.0))
+    place = exp(-np.arccos(here @ there / norm(here) / norm(there)) / np.radians(30.0))
     assert 0.1 < place < 0.95
-    transition[14:17, 14:17] = place * np.eye(3)
+    transition[14:17, 14:17] = place * eye(3)
     noise = np.zeros((24, 24))
     noise[:9, :9] = model.noise
-    noise[9:12, 9:12] = np.eye(3) * 2e-4**2 * (1.0 - tilt**2)
-    noise[12:14, 12:14] = np.eye(2) * 0.25**2 * (1.0 - shift**2)
-    noise[14:17, 14:17] = np.diag([15.0, 12.0, 10.0]) ** 2 * (1.0 - place**2)
+    noise[9:12, 9:12] = eye(3) * 2e-4**2 * (1.0 - tilt**2)
+    noise[12:14, 12:14] = eye(2) * 0.25**2 * (1.0 - shift**2)
+    noise[14:17, 14:17] = diag([15.0, 12.0, 10.0]) ** 2 * (1.0 - place**2)
     assert_allclose(found.mean, transition @ prior.mean, rtol=1e-12)
     expected = transition @ prior.covariance @ transition.T + noise
-    scale = np.sqrt(np.diag(expected))
+    scale = sqrt(diag(expected))
     assert_allclose(found.covariance / scale / scale[:, None], expected / scale / scale[:, None], atol=1e-12)
     assert_array_equal(found.covariance, found.covariance.T)
     assert found.ticks == 1_300 * SECOND and found.craters.tolist() == [2, 0]
@@ -312,13 +309,13 @@ def test_slow_errors_come_to_rest_at_the_size_they_are_said_to_have():
 
     class Still(Drift):
         def propagate(self, state, from_ticks, to_ticks):
-            return Prediction(state, np.eye(9), np.zeros((9, 9)))
+            return Prediction(state, eye(9), np.zeros((9, 9)))
 
     for k in range(1, 400):
         following = kalman.predict(state, 100 * k * SECOND, Still(), ERRORS)
         assert following is not None
         state = following
-    sigma = np.sqrt(np.diag(state.covariance))
+    sigma = sqrt(diag(state.covariance))
     assert_allclose(sigma[9:12], 2e-4, rtol=1e-9)
     assert_allclose(sigma[12:14], 0.25, rtol=1e-9)
     assert_allclose(sigma[14:18], [15.0, 12.0, 10.0, 5e-4], rtol=1e-9)
@@ -329,14 +326,14 @@ def test_the_first_state_holds_what_it_is_given():
         77, POSITION_ICRF, np.array([1.0, 2.0, 3.0]), 500.0, 0.5, (1e-6, 2e-6, 3e-6), ERRORS
     )
     expected = [500.0] * 3 + [0.5] * 3 + [1e-6, 2e-6, 3e-6] + [2e-4] * 3 + [0.25] * 2 + [15.0, 12.0, 10.0, 5e-4]
-    assert_allclose(state.covariance, np.diag(np.square(expected)), rtol=1e-12)
+    assert_allclose(state.covariance, diag(np.square(expected)), rtol=1e-12)
     assert_array_equal(state.mean[:6], [*POSITION_ICRF, 1.0, 2.0, 3.0])
     assert state.mean[17] == 2e-4 and not state.mean[6:17].any()
     assert state.ticks == 77 and not state.craters.size
     assert state.position_sigma_m == approx(500.0)
     # The worst direction counts.
     axes = Rotation.from_rotvec([0.4, 0.5, -0.2]).as_matrix()
-    state.covariance[:3, :3] = axes @ np.diag([4.0, 100.0, 9.0]) @ axes.T
+    state.covariance[:3, :3] = axes @ diag([4.0, 100.0, 9.0]) @ axes.T
     assert state.position_sigma_m == approx(10.0)
 
 
@@ -346,10 +343,10 @@ def test_burns_and_restarts_add_what_they_leave_unknown():
     assert_allclose(burnt.mean[3:6], prior.mean[3:6] + np.array([1.0, -2.0, 0.5]))
     assert_allclose(np.delete(burnt.mean, [3, 4, 5]), np.delete(prior.mean, [3, 4, 5]))
     added = np.zeros_like(prior.covariance)
-    added[3:6, 3:6] = np.eye(3) * 9e-4
+    added[3:6, 3:6] = eye(3) * 9e-4
     assert_allclose(burnt.covariance, prior.covariance + added, rtol=1e-12)
     wide = kalman.widened(prior, 40.0, 0.2)
-    added[:3, :3], added[3:6, 3:6] = np.eye(3) * 1_600.0, np.eye(3) * 0.04
+    added[:3, :3], added[3:6, 3:6] = eye(3) * 1_600.0, eye(3) * 0.04
     assert_allclose(wide.covariance, prior.covariance + added, rtol=1e-12)
     assert_array_equal(wide.mean, prior.mean)
 
@@ -368,28 +365,27 @@ def test_craters_come_and_go_with_their_correlations():
     assert grown.craters.tolist() == [4, 1, 6, 2, 0]
     assert_array_equal(grown.covariance[:27, :27], prior.covariance)
     # A new crater stands where the common offset has it now, and is off by its own error beyond that.
-    offset, own = prior.covariance[14:17, 14:17], np.diag([1.0, 4.0, 9.0, 49.0, 64.0, 81.0])
+    offset, own = prior.covariance[14:17, 14:17], diag([1.0, 4.0, 9.0, 49.0, 64.0, 81.0])
     assert_allclose(grown.covariance[27:, 27:], np.tile(offset, (2, 2)) + own)
     assert_array_equal(grown.covariance[27:, :27], np.tile(prior.covariance[14:17], (2, 1)))
     assert_array_equal(grown.mean[27:], np.tile(prior.mean[14:17], 2))
     turned = prior.with_craters(kalman.TURN, np.ones((1, 3)))
     assert not turned.covariance[27:, :27].any() and not turned.mean[27:].any()
     assert prior.with_craters(np.array([4]), np.ones((1, 3))) is prior
-    none = first_state()
-    assert none.slots(np.array([3])).tolist() == [-1]
+    assert first_state().slots(np.array([3])).tolist() == [-1]
 
 
 def test_joseph_form_holds_for_a_gain_that_is_not_optimal():
     rng = default_rng(6)
     root, design = rng.standard_normal((5, 5)), rng.standard_normal((2, 5))
-    covariance, noise = root @ root.T, np.diag([0.3, 0.7])
+    covariance, noise = root @ root.T, diag([0.3, 0.7])
     gain = rng.standard_normal((5, 2))
     # The error after x' = x + K (z - H x) by drawing: (1 - K H) e - K v.
     errors = rng.multivariate_normal(np.zeros(5), covariance, 400_000)
     noises = rng.multivariate_normal(np.zeros(2), noise, 400_000)
-    after = errors @ (np.eye(5) - gain @ design).T - noises @ gain.T
+    after = errors @ (eye(5) - gain @ design).T - noises @ gain.T
     found = kalman.corrected_covariance(covariance, design, gain, noise)
-    scale = np.sqrt(np.diag(found))
+    scale = sqrt(diag(found))
     # 400,000 draws know a covariance to 0.2 %; four of that.
     assert_allclose(np.cov(after.T) / scale / scale[:, None], found / scale / scale[:, None], atol=0.01)
 
@@ -398,7 +394,7 @@ def test_a_hundred_thousand_updates_leave_the_covariance_symmetric_and_positive(
     """A prior of 10 km against measurements of a millimetre: 1e14 in variance."""
     rng = default_rng(7)
     size, count = 4, 2
-    covariance, noise = np.eye(size) * 1e8, np.eye(count) * 1e-6
+    covariance, noise = eye(size) * 1e8, eye(count) * 1e-6
     designs = rng.standard_normal((50, count, size))
     least, lopsided = np.inf, 0.0
     for k in range(100_000):
@@ -407,12 +403,12 @@ def test_a_hundred_thousand_updates_leave_the_covariance_symmetric_and_positive(
         gain = np.linalg.solve(crossed @ design.T + noise, crossed).T
         covariance = kalman.corrected_covariance(covariance, design, gain, noise)
         if k % 1_000 == 0 or k < 100:
-            scale = np.sqrt(np.diag(covariance))
+            scale = sqrt(diag(covariance))
             least = min(least, float(eigvalsh(covariance / scale / scale[:, None])[0]))
             lopsided = max(lopsided, float(np.abs(covariance - covariance.T).max()))
         # A coast: everything is forgotten again.
         if k % 10 == 9:
-            covariance = covariance + np.eye(size) * 1e8
+            covariance = covariance + eye(size) * 1e8
     assert np.all(np.isfinite(covariance)) and least > 0.0
     assert lopsided == 0.0
 
@@ -447,7 +443,7 @@ def test_a_table_of_burns_comes_back_in_order_of_time():
     assert len(unpack_burn_table(pack_burn_table(no_burns()))) == 0
 
 
-@mark.parametrize("count, kick, sigma", [(2, KICK, 0.1), (1, KICK, -0.1), (1, np.nan * KICK, 0.1)])
+@mark.parametrize("count, kick, sigma", [(2, KICK, 0.1), (1, KICK, -0.1), (1, nan * KICK, 0.1)])
 def test_burns_at_one_time_negative_sigmas_and_nan_are_refused(count, kick, sigma):
     table = BurnTable(np.full(count, START), np.tile(kick, (count, 1)), np.full(count, sigma))
     with raises(TableError, match="burn table"):
@@ -456,8 +452,7 @@ def test_burns_at_one_time_negative_sigmas_and_nan_are_refused(count, kick, sigm
 
 def test_a_burn_is_flown_at_its_time_and_not_before(model):
     state, stop = start_state(), START + 900 * SECOND
-    half = model.propagate(state, START, START + 600 * SECOND)
-    kicked = half.state.copy()
+    kicked = model.propagate(state, START, START + 600 * SECOND).state.copy()
     kicked[3:6] += KICK
     rest = model.propagate(kicked, START + 600 * SECOND, stop)
     assert_array_equal(flown(model, state, START, stop, TABLE), rest.state)
@@ -469,7 +464,7 @@ class Turning(Drift):
     """Dynamics that turn position and velocity by 0.23 degrees a call, so that the offset is renewed a little."""
 
     def propagate(self, state, from_ticks, to_ticks):
-        transition = np.eye(9)
+        transition = eye(9)
         if to_ticks > from_ticks:
             transition[:3, :3] = transition[3:6, 3:6] = Rotation.from_rotvec([0.0, 0.0, 4e-3]).as_matrix()
         return Prediction(transition @ state, transition, np.zeros((9, 9)))
@@ -481,7 +476,7 @@ def log_likelihood(prior, landmarks, index, nis):
     pose = kalman.pose_of(state, CAMERA_FROM_ICRF, MCMF_FROM_ICRF)
     design = kalman.design_matrix(look(landmarks, index, pose, CAMERA, state.shifts(index)), state)
     design = design.reshape(-1, state.mean.size)
-    spread = design @ state.covariance @ design.T + 0.7 * np.eye(len(design))
+    spread = design @ state.covariance @ design.T + 0.7 * eye(len(design))
     return -0.5 * (nis + float(np.linalg.slogdet(spread)[1]))
 
 
@@ -509,9 +504,9 @@ def test_the_slope_is_the_derivative_of_state_and_likelihood_by_the_size_of_the_
         return state, logarithm, score, information
 
     (low, below, *_), (middle, _, score, information), (high, above, *_) = (
-        flown(30.0 * np.exp(0.5 * x)) for x in (-0.01, 0.0, 0.01)
+        flown(30.0 * exp(0.5 * x)) for x in (-0.01, 0.0, 0.01)
     )
-    sigma = np.sqrt(np.diag(middle.covariance))
+    sigma = sqrt(diag(middle.covariance))
     assert_allclose(middle.slope.mean / sigma, (high.mean - low.mean) / 0.02 / sigma, atol=1e-3)
     both = sigma[:, None] * sigma
     changed = (high.covariance - low.covariance) / 0.02 / both
@@ -582,12 +577,12 @@ def test_the_score_of_the_noise_is_the_derivative_of_the_likelihood_with_its_exp
     root, innovation = rng.standard_normal((4, 3)), 2.0 * rng.standard_normal(4)
 
     def spread(x):
-        return root @ root.T + np.exp(x) * np.diag(noise)
+        return root @ root.T + exp(x) * diag(noise)
 
     def logarithm(x):
         return -0.5 * (innovation @ np.linalg.solve(spread(x), innovation) + np.linalg.slogdet(spread(x))[1])
 
     contradiction, (score, information) = kalman._judged(spread(0.0), innovation, noise)
     assert score == approx((logarithm(1e-4) - logarithm(-1e-4)) / 2e-4, rel=1e-6) and abs(score) > 0.1
-    relative = np.linalg.solve(spread(0.0), np.diag(noise))
+    relative = np.linalg.solve(spread(0.0), diag(noise))
     assert information == approx(0.5 * np.trace(relative @ relative)) and contradiction.shape == (2,)

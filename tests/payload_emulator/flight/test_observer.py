@@ -1,11 +1,11 @@
-"""What of a frame reaches the estimators, what is reported, and how reads and troubles are counted."""
+"""Parts of a frame that reach the estimators, reports of it, and counts of reads and troubles."""
 
 import re
 from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
-import pytest
+from numpy import degrees, nan, radians
 from numpy.testing import assert_allclose, assert_array_equal
 from pytest import approx, fixture, mark
 
@@ -103,7 +103,7 @@ class Navigator:
             raise np.linalg.LinAlgError
         return self.state, AnchoredReport(
             self.outcome, 0.1, -0.2, 30e3, (1.0, 2.0, 3.0), (4.0, 6.0, 5.0), 7.0, 3, 9, 11, self.reacquired,
-            self.lost, self.fix, self.new_landmarks, np.radians(0.01), self.attitude_noise_rad, self.offset
+            self.lost, self.fix, self.new_landmarks, radians(0.01), self.attitude_noise_rad, self.offset
         )  # fmt: skip
 
     def widen(self, state, position_m, velocity_m_s):
@@ -154,7 +154,7 @@ def items(rig, name, *fields):
 
 def outcome_of(rig, **values):
     """The packet `frame_outcome` with these values and those of a frame without estimate."""
-    nothing = approx(np.nan, nan_ok=True)
+    nothing = approx(nan, nan_ok=True)
     return {
         "frame_number": 0, "image_ticks": rig.telemetry.ticks, "estimator": 0, "reset_trigger": 0, "detections": 6,
         "candidate_pairs": 0, "pairs": 0, "shift_east_m": nothing, "shift_north_m": nothing, "anchor_reads": 0, **values
@@ -184,8 +184,8 @@ def test_pairs_name_the_detection_by_its_place_among_those_reported(rig):
 
 
 def test_weak_detections_and_those_far_outside_reach_nobody(rig):
-    u = np.array([100.0, 2e5, np.nan, 120.0, 130.0, 140.0])
-    rig.eye.found = Detections(u, *(np.full(6, 50.0),) * 2, np.array([0.9, 0.9, 0.9, 0.3, np.nan, 0.5]), np.ones(6))
+    u = np.array([100.0, 2e5, nan, 120.0, 130.0, 140.0])
+    rig.eye.found = Detections(u, *(np.full(6, 50.0),) * 2, np.array([0.9, 0.9, 0.9, 0.3, nan, 0.5]), np.ones(6))
     look(rig, score_floor=0.5)
     ((_, given, _),) = rig.navigator.given
     # A score at the floor is used; one that is no number is not below it.
@@ -219,7 +219,7 @@ def test_a_detector_that_fails_or_is_late_gives_no_detections(rig):
     assert rig.observer.summary()["no_image_reasons"] == {"detector failed": 2}
 
 
-@mark.parametrize("length, known", [(1.0, True), (1.0009, True), (1.0011, False), (np.nan, False), (None, False)])
+@mark.parametrize("length, known", [(1.0, True), (1.0009, True), (1.0011, False), (nan, False), (None, False)])
 def test_an_attitude_is_a_unit_quaternion_or_none(rig, length, known):
     look(rig, attitude=np.zeros(0) if length is None else np.r_[length, ATTITUDE[1:]])
     given = rig.navigator.given[0][2]
@@ -232,7 +232,7 @@ def test_an_attitude_is_a_unit_quaternion_or_none(rig, length, known):
 def test_the_sun_is_handed_on_where_it_is_known(rig):
     look(rig)
     assert_array_equal(rig.eye.sun, [0.0, 0.0, -1.0])
-    look(rig, attitude=np.array([1.0, 0, 0, 0, np.nan, 0, 0]))
+    look(rig, attitude=np.array([1.0, 0, 0, 0, nan, 0, 0]))
     assert rig.eye.sun is None
 
 
@@ -247,7 +247,7 @@ def test_lasting_trouble_is_reported_at_its_beginning(rig):
 
 def test_an_attitude_noisier_than_declared_is_reported_at_its_beginning_and_end(rig):
     for noise_deg in (0.0, 0.2, 0.3, 0.0, 0.0, 1.0):
-        rig.navigator.attitude_noise_rad = np.radians(noise_deg)
+        rig.navigator.attitude_noise_rad = radians(noise_deg)
         look(rig)
     found = [event for event in rig.telemetry.events if event[1].startswith("attitude")]
     degraded, restored = ("medium", "attitude_degraded"), ("info", "attitude_restored")
@@ -311,12 +311,12 @@ def test_a_frame_of_odometry_is_reported_in_full(rig, monkeypatch):
         assert was is before and more == {"manual_step": manual}
         assert (ticks, mode) == (rig.telemetry.ticks, Mode.spherical) and len(found) == 6
         assert table is anchor and camera is parameters.camera and tuned is parameters.odometry
-    nothing = (np.nan,) * 3
+    nothing = (nan,) * 3
     expected = {
         "frame_number": 5, "image_ticks": rig.telemetry.ticks, "estimator": 1, "outcome": 1,
-        "latitude_deg": approx(np.degrees(0.2)), "longitude_deg": approx(360.0 - np.degrees(0.3)),
+        "latitude_deg": approx(degrees(0.2)), "longitude_deg": approx(360.0 - degrees(0.3)),
         "altitude_m": 31e3, "velocity_icrf_m_s": approx(nothing, nan_ok=True),
-        "sigma_rtn_m": approx(nothing, nan_ok=True), "nis": approx(np.nan, nan_ok=True), "matched": 4
+        "sigma_rtn_m": approx(nothing, nan_ok=True), "nis": approx(nan, nan_ok=True), "matched": 4
     }  # fmt: skip
     first, second = rig.named("navigation_state")
     assert first == expected and second == {**expected, "frame_number": 6}
@@ -342,8 +342,8 @@ def test_odometry_without_a_position_reports_its_outcome_alone(rig, monkeypatch)
     assert rig.named("frame_outcome") == [outcome_of(rig, outcome=Outcome.missed)]
     observer._states[Mode.paper] = (object(), None)
     report = SimpleNamespace(
-        outcome=Outcome.rejected, reset_trigger=ResetTrigger.none, candidate_pairs=3, pairs=0, shift_east_m=np.nan,
-        shift_north_m=np.nan
+        outcome=Outcome.rejected, reset_trigger=ResetTrigger.none, candidate_pairs=3, pairs=0, shift_east_m=nan,
+        shift_north_m=nan
     )  # fmt: skip
     monkeypatch.setattr("payload_emulator.flight.navigation.odometry.odometry.step", lambda *_, **__: (None, report))
     look(rig)
@@ -364,7 +364,7 @@ def test_a_frame_of_the_filter_is_reported_in_full(rig):
     assert rig.named("navigation_state") == [
         {
             "frame_number": 8, "image_ticks": ticks, "estimator": 2, "outcome": int(Outcome.fixed),
-            "latitude_deg": approx(np.degrees(0.1)), "longitude_deg": approx(360.0 - np.degrees(0.2)),
+            "latitude_deg": approx(degrees(0.1)), "longitude_deg": approx(360.0 - degrees(0.2)),
             "altitude_m": 30e3, "velocity_icrf_m_s": (1.0, 2.0, 3.0), "sigma_rtn_m": (4.0, 6.0, 5.0), "nis": 7.0,
             "matched": 3
         }
@@ -397,15 +397,15 @@ def test_new_landmarks_go_down_forty_to_a_packet(rig, monkeypatch):
     assert first["items"]["landmark_id"].tolist() == list(range(40))
     assert (second["frame_number"], second["image_ticks"]) == (0, rig.telemetry.ticks)
     assert {name: values.tolist() for name, values in second["items"].items()} == {
-        "landmark_id": [40.0], "latitude_deg": [approx(np.degrees(0.4))],
-        "longitude_deg": [approx(360.0 - np.degrees(0.4))], "height_m": [41.0], "diameter_m": [42.0],
+        "landmark_id": [40.0], "latitude_deg": [approx(degrees(0.4))],
+        "longitude_deg": [approx(360.0 - degrees(0.4))], "height_m": [41.0], "diameter_m": [42.0],
         "sigma_east_m": [43.0], "sigma_north_m": [44.0], "sigma_up_m": [45.0], "sightings": [46.0], "passes": [47.0]
     }  # fmt: skip
 
 
 def test_detections_are_reported_within_the_range_of_their_fields_and_with_their_class(rig):
     """From 30 km a crater in the centre of 6, 12 and 20 km is as wide as f D / h; 4 km is no class of 5 to 30 km."""
-    focal_px = 256.0 / np.tan(np.radians(60.0))
+    focal_px = 256.0 / np.tan(radians(60.0))
     diameter = focal_px * np.array([6e3, 12e3, 20e3, 4e3, 6e3]) / 30e3
     rig.eye.found = Detections(
         np.array([255.5, 255.5, 255.5, 255.5, -3.0]), np.array([255.5, 255.5, 255.5, 255.5, 2_000.0]), diameter,
@@ -471,7 +471,7 @@ def test_a_sigma_point_filter_in_the_row_of_the_filter_flies_the_demo(tmp_path, 
     assert flown["fixed_share_imaging"] == 1.0 and flown["wrong_fixes"] == 0
     (arc,) = flown["per_arc"]
     assert arc["propagate_only_m"] > 900.0 > 100.0 > arc["max_m"]
-    assert flown["nis_per_degree"] == pytest.approx(0.603, abs=0.005)
+    assert flown["nis_per_degree"] == approx(0.603, abs=0.005)
 
 
 def test_what_was_learned_of_a_catalogue_is_kept_until_another_one_is_loaded():

@@ -77,8 +77,7 @@ def test_a_descending_pass_is_followed_to_the_south_and_every_use_of_the_anchor_
 
 def test_the_planar_system_recovers_an_exact_planar_motion():
     # Ten points of a plane seen from h = 30 km and, moved (0.3, 24.5, 0.2) km, from h + 0.2 km.
-    rng = np.random.default_rng(4)
-    ground = rng.uniform(-25e3, 25e3, (10, 2)) + np.array([0.0, 12e3])
+    ground = np.random.default_rng(4).uniform(-25e3, 25e3, (10, 2)) + np.array([0.0, 12e3])
     h, move = 30_000.0, np.array([300.0, 24_500.0, 200.0])
     features = []
     for shift, altitude in ((np.zeros(2), h), (move[:2], h + move[2])):
@@ -139,8 +138,7 @@ def test_frames_without_detections_repeat_the_last_motion_over_their_time_and_th
     latitude, step_north = stream.state.latitude_rad, stream.state.last_motion.north_m
     reports = [stream.frame("none") for _ in range(22)]
     assert [report.outcome for report in reports] == [Outcome.predicted] * 20 + [Outcome.missed] * 2
-    moved_m = moon.radius_m * (stream.state.latitude_rad - latitude)
-    assert moved_m == approx(20 * step_north, rel=1e-9)
+    assert moon.radius_m * (stream.state.latitude_rad - latitude) == approx(20 * step_north, rel=1e-9)
     stream = Stream(moon, 0)
     stream.frame("none")
     held = stream.state
@@ -169,8 +167,7 @@ def test_motion_against_the_pass_is_rejected_and_predicted_over(moon):
 @mark.parametrize("wait_s, expected", [(60.0, ResetTrigger.none), (60.1, ResetTrigger.time_gap)])
 def test_a_gap_longer_than_the_limit_puts_the_state_back_onto_the_anchor(moon, wait_s, expected):
     stream = Stream(moon)
-    report = stream.frame(wait_s=wait_s)
-    assert report.reset_trigger is expected
+    assert stream.frame(wait_s=wait_s).reset_trigger is expected
     assert stream.state.resets == (2 if expected is ResetTrigger.time_gap else 1)
 
 
@@ -204,8 +201,7 @@ def test_detections_with_nan_or_beyond_the_horizon_match_nothing():
         nan, np.array([5.0, np.nan, 20.0]), np.array([30.0, 30.0, np.nan]), np.ones(3), np.ones(3)
     )
     for mode in (Mode.paper, Mode.spherical):
-        features = odometry.frame_features(seen, 30_000.0, CAMERA, mode)
-        assert features.ground.size_class.tolist() == [-1, -1, -1]
+        assert odometry.frame_features(seen, 30_000.0, CAMERA, mode).ground.size_class.tolist() == [-1, -1, -1]
     high = odometry.frame_features(
         odometry.Detections(*(np.array([value]) for value in (0.0, 0.0, 9.0, 1.0, 1.0))), 400_000.0, CAMERA,
         Mode.spherical

@@ -126,8 +126,7 @@ def test_a_manual_step_command_resets_both_estimators_and_is_verified(moon):
 
 def test_a_damaged_telecommand_is_refused_and_counted(moon):
     good = command("test_connection")
-    flown = payload(moon, [EMPTY])
-    packets = flown.step(IMAGE, ATTITUDE, moon.ticks_at(FIRST_S), good[:-1] + bytes([good[-1] ^ 1]))
+    packets = payload(moon, [EMPTY]).step(IMAGE, ATTITUDE, moon.ticks_at(FIRST_S), good[:-1] + bytes([good[-1] ^ 1]))
     assert [v["failure_code"] for v in named(packets, "verification_not_accepted")] == [2]
     assert named(packets, "housekeeping")[0]["telecommands_rejected"] == 1
 

@@ -47,14 +47,12 @@ def with_number(command, packed, sent):
     """A telecommand with another number than the dictionary would pack, and a right checksum."""
     for form in (">d", ">f"):
         if struct.pack(form, packed) in command:
-            changed = command.replace(struct.pack(form, packed), struct.pack(form, sent), 1)
-            return append_crc(changed[:-2])
+            return append_crc(command.replace(struct.pack(form, packed), struct.pack(form, sent), 1)[:-2])
     raise AssertionError("the number is not in the telecommand")
 
 
 def test_values_out_of_range_are_refused_at_acceptance(rig):
-    good = rig.command("set_time_report_rate", rate_exponent=8)
-    values = bytearray(good)
+    values = bytearray(rig.command("set_time_report_rate", rate_exponent=8))
     values[11] = 9
     assert rig.refused(append_crc(bytes(values[:-2]))) == ["value_out_of_range"]
     for order in (
@@ -106,8 +104,7 @@ def test_a_window_is_observed_by_the_schedule_and_ends_by_itself(rig):
 
 def test_the_cadence_of_a_window_thins_the_frames(rig):
     rig.step(rig.function("start_observation", 0.0, 30.0), image=None, seconds=0.5)
-    seen = [len(rig.named(rig.step(), "detections")) for _ in range(6)]
-    assert sum(seen) == 3
+    assert sum([len(rig.named(rig.step(), "detections")) for _ in range(6)]) == 3
 
 
 def test_scheduled_telecommands_are_refused_when_expired_copied_nested_or_too_many(rig):
@@ -142,8 +139,7 @@ def test_a_held_schedule_releases_nothing_and_what_is_late_then_expires(rig):
     assert len(rig.named(packets, "connection_report")) == 1
     assert rig.refused(rig.command("delete_activity", request_id=1)) == ["no_such_activity"]
     rig.step(rig.at(500.0, rig.command("test_connection")) + rig.command("reset_schedule"))
-    report = rig.report("report_schedule")
-    assert report["count"] == 0
+    assert rig.report("report_schedule")["count"] == 0
 
 
 def test_the_schedule_survives_a_reset(rig):
@@ -195,8 +191,7 @@ def test_a_structure_defined_by_telecommand_is_sent_reported_and_deleted(rig):
     labels = DICTIONARY.labels("housekeeping_report", "quantity")
     assert [labels[code] for code in first[0]["items"]["quantity"]] == quantities
     assert first[0]["items"]["value"][0] == 1.0
-    seen = [len(rig.named(rig.step(), "housekeeping_report")) for _ in range(6)]
-    assert sum(seen) == 3
+    assert sum([len(rig.named(rig.step(), "housekeeping_report")) for _ in range(6)]) == 3
     rig.boot(ResetCause.brown_out)
     report = rig.send("report_housekeeping_definition", structure_id=16)
     definition = rig.named(report, "housekeeping_definition")[0]
@@ -289,8 +284,7 @@ def test_a_thumbnail_comes_down_as_large_data(rig):
 
 def test_the_map_of_landmarks_has_its_documented_octets(rig):
     # Crater (4 octets) and number of frames (2), big-endian; the count stays at its largest value.
-    octets = map_octets({7: 3, 4_000_000_000: 70_000})
-    assert octets.hex(" ", 2) == "0000 0007 0003 ee6b 2800 ffff"
+    assert map_octets({7: 3, 4_000_000_000: 70_000}).hex(" ", 2) == "0000 0007 0003 ee6b 2800 ffff"
     assert map_octets({}) == b""
     packets = rig.perform("downlink_map")
     assert [v["table"] for v in rig.named(packets, "large_data_last")] == []
@@ -333,8 +327,7 @@ def test_the_store_keeps_what_no_link_takes_and_plays_it_again_by_time(rig):
     from_ticks = rig.ticks
     for _ in range(4):
         assert rig.step() == []
-    waiting = rig.payload.waiting
-    assert waiting > 8
+    assert rig.payload.waiting > 8
     rig.board.downlink = 1 << 30
     late = rig.step(rig.function("stop_observation") + rig.function("set_mode", PayloadMode.downlinking))
     assert len(rig.named(late, "detections")) == 5

@@ -10,6 +10,7 @@ Nørgaard, Poulsen, Ravn (2000), New developments in state estimation for nonlin
 from dataclasses import replace
 
 import numpy as np
+from numpy import diag, sqrt
 
 from payload_emulator.flight.navigation.filter import filter as kalman
 from payload_emulator.flight.navigation.filter.attitude_monitor import RotationEvidence
@@ -17,14 +18,13 @@ from payload_emulator.flight.navigation.filter.filter import FilterState, Update
 from payload_emulator.flight.navigation.sighting import look
 
 # The best distance of the points for a Gaussian, in standard deviations.
-_H = np.sqrt(3.0)
+_H = sqrt(3.0)
 
 
 def _differences(centre, plus, minus):
     """Return mean (m,) of a function, and its first and second differences (m, n), from its values at the points."""
-    count = plus.shape[0]
-    mean = (_H**2 - count) / _H**2 * centre + (plus + minus).sum(axis=0) / (2.0 * _H**2)
-    second = np.sqrt(_H**2 - 1.0) / (2.0 * _H**2) * (plus + minus - 2.0 * centre)
+    mean = (_H**2 - plus.shape[0]) / _H**2 * centre + (plus + minus).sum(axis=0) / (2.0 * _H**2)
+    second = sqrt(_H**2 - 1.0) / (2.0 * _H**2) * (plus + minus - 2.0 * centre)
     return mean, (plus - minus).T / (2.0 * _H), second.T
 
 
@@ -65,7 +65,7 @@ def update(prior, camera_from_icrf, mcmf_from_icrf, landmarks, index, uv_px, var
     root = np.linalg.cholesky(prior.covariance)
     points = [np.array([seen(prior.mean + sign * _H * move) for move in root.T]) for sign in (1.0, -1.0)]
     expected, first, second = _differences(seen(prior.mean), *points)
-    noise = np.diag(np.repeat(variance_px2, 2)) + second @ second.T
+    noise = diag(np.repeat(variance_px2, 2)) + second @ second.T
     spread = first @ first.T + noise
     innovation = uv_px.reshape(-1) - expected
     if not (np.all(np.isfinite(innovation)) and np.all(np.isfinite(spread))):
@@ -83,8 +83,8 @@ def update(prior, camera_from_icrf, mcmf_from_icrf, landmarks, index, uv_px, var
     judged, noise_score = kalman._judged(spread, innovation, np.repeat(variance_px2, 2))
     return Update(
         state.only_craters(state.craters[state.craters != kalman.TURN[0]]), float(innovation @ solved[:, 0]),
-        innovation.reshape(-1, 2).sum(axis=0) / np.sqrt(np.diag(summed)), uv_px - seen(mean).reshape(-1, 2),
-        mean[turns], float(np.sqrt(np.max(np.linalg.eigvalsh(left)))),
+        innovation.reshape(-1, 2).sum(axis=0) / sqrt(diag(summed)), uv_px - seen(mean).reshape(-1, 2),
+        mean[turns], float(sqrt(np.max(np.linalg.eigvalsh(left)))),
         RotationEvidence(turning.T @ solved[:, 0], turning.T @ solved[:, 1:], errors.attitude_noise_rad),
         judged, noise_score=noise_score
     )  # fmt: skip

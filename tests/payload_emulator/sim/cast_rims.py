@@ -3,6 +3,7 @@
 import math
 
 import numpy as np
+from numpy import cos, sin
 
 from lunar.camera import project_mcmf
 from lunar.constants import MOON_RADIUS_M
@@ -38,7 +39,7 @@ def rim_errors(terrain, camera, position_mcmf_m, camera_from_mcmf):
         return index, np.empty((0, 2))
     latitude, longitude = _circle(craters.latitude_rad, craters.longitude_rad, craters.diameter_m)
     level = np.broadcast_to(craters.rim_height_m[:, None], latitude.shape)
-    tilted = level + terrain.rim_tilts_m(index) @ np.stack([np.cos(AZIMUTH), np.sin(AZIMUTH)])
+    tilted = level + terrain.rim_tilts_m(index) @ np.stack([cos(AZIMUTH), sin(AZIMUTH)])
     centre = project_mcmf(camera, rotation, position, craters.position_mcmf_m)
     expected = project_mcmf(camera, rotation, position, mcmf_from_spherical(latitude, longitude, tilted))
     circle = project_mcmf(camera, rotation, position, mcmf_from_spherical(latitude, longitude, level))
@@ -48,8 +49,7 @@ def rim_errors(terrain, camera, position_mcmf_m, camera_from_mcmf):
     uv = expected
     for _ in range(ROUNDS):
         hit = cast(terrain, camera, position, rotation, uv.reshape(-1, 2)).reshape(*latitude.shape, 3)
-        height = spherical_from_mcmf(hit)[2]
-        rim = mcmf_from_spherical(latitude, longitude, height)
+        rim = mcmf_from_spherical(latitude, longitude, spherical_from_mcmf(hit)[2])
         miss = np.linalg.norm(hit - rim, axis=-1)
         uv = np.where((miss > FOUND_M)[..., None], project_mcmf(camera, rotation, position, rim), uv)
     found = miss <= FOUND_M
@@ -63,7 +63,7 @@ def rim_errors(terrain, camera, position_mcmf_m, camera_from_mcmf):
 def _circle(latitude, longitude, diameter_m):
     """Places (n, 48) on the rims."""
     radius = (0.5 * diameter_m / MOON_RADIUS_M)[:, None]
-    sine0, cosine0 = np.sin(latitude)[:, None], np.cos(latitude)[:, None]
-    sine = sine0 * np.cos(radius) + cosine0 * np.sin(radius) * np.cos(AZIMUTH)
-    east = np.sin(AZIMUTH) * np.sin(radius) * cosine0
-    return np.arcsin(sine), longitude[:, None] + np.arctan2(east, np.cos(radius) - sine0 * sine)
+    sine0, cosine0 = sin(latitude)[:, None], cos(latitude)[:, None]
+    sine = sine0 * cos(radius) + cosine0 * sin(radius) * cos(AZIMUTH)
+    east = sin(AZIMUTH) * sin(radius) * cosine0
+    return np.arcsin(sine), longitude[:, None] + np.arctan2(east, cos(radius) - sine0 * sine)

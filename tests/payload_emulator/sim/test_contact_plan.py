@@ -3,6 +3,7 @@
 import itertools
 
 import numpy as np
+from numpy import cos, pi, radians, sin
 from numpy.linalg import norm
 from pytest import approx, fixture, mark, raises
 
@@ -24,16 +25,15 @@ SPEED_OF_LIGHT_M_S = 299_792_458.0
 def ephemeris():
     """A circular polar orbit of 1768 km about the Moon, 111 minutes, whose plane holds the line to the Earth."""
     times = np.arange(START - 600 * NS, STOP + 600 * NS, 30 * NS)
-    angle = 2.0 * np.pi * (times - START) / (6_672.0 * NS)
+    angle = 2.0 * pi * (times - START) / (6_672.0 * NS)
     toward = np.asarray(earth_position_icrf_m(float(tdb_s_from_utc_ns(START))))
     first = toward / norm(toward)
     second = np.array([0.0, 0.0, 1.0]) - first[2] * first
     second /= norm(second)
-    rate = 2.0 * np.pi / 6_672.0
-    position = 1.768e6 * (np.cos(angle)[:, None] * first + np.sin(angle)[:, None] * second)
-    velocity = 1.768e6 * rate * (-np.sin(angle)[:, None] * first + np.cos(angle)[:, None] * second)
-    segment = EphemerisSegment(times, position, velocity, object_name="A", object_id="A", degree=7)
-    return Ephemeris((segment,))
+    rate = 2.0 * pi / 6_672.0
+    position = 1.768e6 * (cos(angle)[:, None] * first + sin(angle)[:, None] * second)
+    velocity = 1.768e6 * rate * (-sin(angle)[:, None] * first + cos(angle)[:, None] * second)
+    return Ephemeris((EphemerisSegment(times, position, velocity, object_name="A", object_id="A", degree=7),))
 
 
 def elevation_deg(ephemeris, utc_ns, station):
@@ -41,8 +41,8 @@ def elevation_deg(ephemeris, utc_ns, station):
     position, _ = ephemeris.at(np.array([utc_ns]))
     from_earth = position[0] - np.asarray(earth_position_icrf_m(float(tdb_s_from_utc_ns(utc_ns))))
     days = utc_ns / NS / 86_400.0 + 2_440_587.5 - 2_451_545.0
-    sidereal = np.radians((280.46061837 + 360.98564736629 * days) % 360.0)
-    cosine, sine = np.cos(sidereal), np.sin(sidereal)
+    sidereal = radians((280.46061837 + 360.98564736629 * days) % 360.0)
+    cosine, sine = cos(sidereal), sin(sidereal)
     x, y, z = from_earth
     latitude, longitude, height = STATIONS[station]
     _, elevation, _ = Lazy("pymap3d").ecef2aer(
@@ -53,8 +53,7 @@ def elevation_deg(ephemeris, utc_ns, station):
 
 @mark.parametrize("station", ["goldstone", "canberra"])
 def test_contacts_are_where_pymap3d_sees_the_spacecraft_above_the_lowest_elevation(ephemeris, station):
-    section = LinkSection(stations=(station,))
-    plan = plan_contacts(ephemeris, section, START, STOP)
+    plan = plan_contacts(ephemeris, LinkSection(stations=(station,)), START, STOP)
     assert plan
     inside = np.zeros(1440, bool)
     minutes = START + np.arange(1440) * 60 * NS
@@ -88,10 +87,9 @@ def test_one_station_at_a_time_has_the_contact_at_the_light_time_of_its_range_cu
     contact = plan_contacts(ephemeris, LinkSection(stations=("madrid",)), START, STOP)[0]
     utc_ns = contact.start_utc_ns + 137 * NS
     position = ephemeris.at(np.array([utc_ns]))[0][0]
-    earth = np.asarray(earth_position_icrf_m(float(tdb_s_from_utc_ns(utc_ns))))
-    centre_s = norm(position - earth) / SPEED_OF_LIGHT_M_S
+    centre_s = norm(position - np.asarray(earth_position_icrf_m(float(tdb_s_from_utc_ns(utc_ns))))) / SPEED_OF_LIGHT_M_S
     # At elevation e the station is R sin(e) nearer than the centre of the Earth: here near 10 deg.
-    expected = centre_s - 6.371e6 * np.sin(np.radians(elevation_deg(ephemeris, utc_ns, "madrid"))) / SPEED_OF_LIGHT_M_S
+    expected = centre_s - 6.371e6 * sin(radians(elevation_deg(ephemeris, utc_ns, "madrid"))) / SPEED_OF_LIGHT_M_S
     assert contact.light_s(utc_ns) == approx(expected, abs=3e-4)
     whole = plan_contacts(ephemeris, LinkSection(stations=("madrid",)), START, STOP)[0]
     assert whole.stop_utc_ns - whole.start_utc_ns > 1800 * NS

@@ -51,8 +51,7 @@ def test_the_cap_is_a_grid_of_65_on_the_sphere_through_the_middle_of_the_relief(
     radius = norm(scene.vertices_km - centre, axis=-1)
     # One sphere, to the rounding of double precision over the Moon's radius in km.
     assert np.ptp(radius) < 1e-8
-    low_m = 1e3 * (radius.mean() - MOON_RADIUS_M / 1e3 - scene.displacement_range_km / 2.0)
-    assert -1500.0 <= low_m < -1400.0
+    assert -1500.0 <= 1e3 * (radius.mean() - MOON_RADIUS_M / 1e3 - scene.displacement_range_km / 2.0) < -1400.0
 
 
 def test_displaced_vertices_lie_on_the_terrain(hilly, scene):
@@ -113,8 +112,7 @@ def test_the_base_colour_of_a_matt_surface_is_its_albedo_and_of_other_laws_bent_
     assert matt.specular_ior > 1.0 and lambert.specular_ior == lunar.specular_ior == 1.0
     # The texel below the camera: the phase angle of nadir is the Sun's distance from the zenith, 80 degrees.
     row, column = texel(matt)
-    below = lambert.albedo[row, column] / matt.albedo[row, column]
-    assert below == approx(exp(-0.7 * radians(80.0)), rel=0.01)
+    assert lambert.albedo[row, column] / matt.albedo[row, column] == approx(exp(-0.7 * radians(80.0)), rel=0.01)
     degrees = 80.0
     weight = 1.0 - 0.019 * degrees + 0.242e-3 * degrees**2 - 1.46e-6 * degrees**3
     mcewen = 2.0 * weight / (1.0 + sin(radians(10.0))) + 1.0 - weight
@@ -213,13 +211,11 @@ def test_blender_gets_the_settings_of_the_paper(tmp_path, scene, blender):
     surface = blender.data.materials.new("regolith").node_tree.nodes["Principled BSDF"]
     assert surface.inputs["Roughness"].default_value == 1.0
     assert 1.0 < surface.inputs["IOR"].default_value < 1.1
-    lamp = blender.data.lights.new("Sun", "SUN")
-    assert lamp.energy == approx(pi)
+    assert blender.data.lights.new("Sun", "SUN").energy == approx(pi)
     vertices, _, faces = blender.data.meshes.new("cap").from_pydata.calls[0]
     assert len(vertices) == 65 * 65 and len(faces) == 64 * 64
     corners = np.array(vertices)[np.array(faces)]
-    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 3] - corners[:, 0])
-    assert (normals[:, 2] > 0.0).all()
+    assert (np.cross(corners[:, 1] - corners[:, 0], corners[:, 3] - corners[:, 0])[:, 2] > 0.0).all()
 
 
 def planes_of(scene, cosine, direct, range_km):
@@ -291,7 +287,7 @@ def test_an_interpreter_that_is_not_there_is_named(scene):
 
 
 @mark.parametrize(
-    ("body", "message"),
+    "body, message",
     [
         ("sys.exit('out of memory')", "status 1: out of memory"),
         ("pass", r"without writing out\.exr, picture\.png, cost\.json"),

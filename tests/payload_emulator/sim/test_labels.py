@@ -3,6 +3,8 @@
 from math import cos, degrees, hypot, isnan, pi, radians, sin, sqrt
 
 import numpy as np
+from numpy.linalg import norm
+from numpy.testing import assert_allclose, assert_array_equal
 from pytest import approx, mark, raises
 
 from lunar.camera import BrownCamera, PinholeCamera, nadir_camera_from_mcmf, pointed_camera_from_mcmf
@@ -37,8 +39,7 @@ def crater_at(latitude_deg, longitude_deg, diameter_m, rim_height_m):
 
 
 def test_a_crater_below_is_as_wide_as_the_lens_makes_it_and_rim_height_moves_one_at_the_edge():
-    catalogue = crater_at(degrees(0.2), degrees(1.0), 5000.0, 2000.0)
-    labels = project_craters(catalogue, CAMERA, *pose(0.2, 1.0))
+    labels = project_craters(crater_at(degrees(0.2), degrees(1.0), 5000.0, 2000.0), CAMERA, *pose(0.2, 1.0))
     assert (labels.u_px[0], labels.v_px[0]) == approx((255.5, 255.5), abs=1e-6)
     # 18 km above the rim, which is wider at 2 km than on the map sphere; its plane lies 1.8 m below its middle.
     width = 5000.0 * (1.0 + 2000.0 / MOON_RADIUS_M)
@@ -50,8 +51,7 @@ def test_a_crater_below_is_as_wide_as_the_lens_makes_it_and_rim_height_moves_one
         for height in (0.0, 1000.0)
     )
     # x = 30 km, and the ground falls 0.26 km over that: u = f x / z, 11.4 px for this kilometre.
-    expected = CAMERA.focal_px * 30.0 * (1.0 / 19.26 - 1.0 / 20.26)
-    assert high - low == approx(expected, rel=0.02)
+    assert high - low == approx(CAMERA.focal_px * 30.0 * (1.0 / 19.26 - 1.0 / 20.26), rel=0.02)
 
 
 def test_labels_lie_on_rims_found_by_casting_rays(formula_terrain):
@@ -69,7 +69,7 @@ def test_labels_lie_on_rims_found_by_casting_rays(formula_terrain):
         v, u = np.mgrid[0:512, 0:512]
         points = position + picture.range_m[..., None] * (CAMERA.rays(np.stack([u, v], axis=-1)) @ rotation)
         centre = mcmf_from_spherical(latitude, longitude, 0.0) / MOON_RADIUS_M
-        up = points / np.linalg.norm(points, axis=-1, keepdims=True)
+        up = points / norm(points, axis=-1, keepdims=True)
         arc = np.arccos(np.clip(up @ centre, -1.0, 1.0)) * MOON_RADIUS_M
         # The disc within the rim: its centroid and area are those of the label's ellipse.
         share = np.clip((4500.0 - arc) / 135.0 + 0.5, 0.0, 1.0)
@@ -101,22 +101,18 @@ def project_rim_middle(catalogue, position, rotation):
 
 
 def test_craters_cut_by_the_edge_say_so_and_those_out_of_sight_or_behind_the_limb_are_none():
-    longitude = degrees(34.2e3 / MOON_RADIUS_M)
-    labels = project_craters(crater_at(0.0, longitude, 9000.0, 0.0), CAMERA, *pose())
+    labels = project_craters(crater_at(0.0, degrees(34.2e3 / MOON_RADIUS_M), 9000.0, 0.0), CAMERA, *pose())
     assert 0.3 < labels.visible_fraction[0] < 0.7
     assert len(project_craters(crater_at(40.0, 100.0, 9000.0, 0.0), CAMERA, *pose())) == 0
-    empty = make_catalogue([], [], [], source="t")
-    assert len(project_craters(empty, CAMERA, *pose())) == 0
-    far = crater_at(0.0, 179.0, 9000.0, 0.0)
-    assert len(project_craters(far, CAMERA, *pose())) == 0
+    assert len(project_craters(make_catalogue([], [], [], source="t"), CAMERA, *pose())) == 0
+    assert len(project_craters(crater_at(0.0, 179.0, 9000.0, 0.0), CAMERA, *pose())) == 0
 
 
 def test_frame_labels_point_into_the_terrains_catalogue(procedural):
     labels = label_frame(procedural, CAMERA, *pose(radians(10.0), radians(20.0)))
     assert len(labels) > 10
-    np.testing.assert_array_equal(procedural.catalogue.diameter_m[labels.index], labels.diameter_m)
-    measured = procedural.measured(labels.index)
-    assert np.isfinite(measured.rim_height_m).all()
+    assert_array_equal(procedural.catalogue.diameter_m[labels.index], labels.diameter_m)
+    assert np.isfinite(procedural.measured(labels.index).rim_height_m).all()
 
 
 def test_ground_in_front_of_a_rim_takes_it_out_of_sight():
@@ -135,8 +131,7 @@ def test_ground_in_front_of_a_rim_takes_it_out_of_sight():
 
 def test_the_ellipse_of_a_crater_at_the_edge_is_that_of_perspective():
     """Seen at 45 degrees a circle is foreshortened to cos 45 across and stretched by the flat image plane."""
-    longitude = degrees(20e3 / MOON_RADIUS_M)
-    label = project_craters(crater_at(0.0, longitude, 3000.0, 0.0), CAMERA, *pose())
+    label = project_craters(crater_at(0.0, degrees(20e3 / MOON_RADIUS_M), 3000.0, 0.0), CAMERA, *pose())
     # On a plane below a nadir pinhole circles stay circles: f D / z, z = 20 km + the fall of 115 m.
     flat = CAMERA.focal_px * 3.0 / 20.115
     assert label.minor_px[0] == approx(flat, rel=0.02)
@@ -155,11 +150,11 @@ def test_planes_come_back_by_name(tmp_path, options):
     read = read_exr(file)
     assert sorted(read) == sorted(PLANES)
     for name, plane in PLANES.items():
-        np.testing.assert_array_equal(read[name], plane)
+        assert_array_equal(read[name], plane)
 
 
 @mark.parametrize(
-    ("octets", "message"),
+    "octets, message",
     [
         (exr_octets(PLANES)[:-5], "expected 3 lines"), (exr_octets(PLANES, kind=1), "32-bit floats"),
         (exr_octets(PLANES, compression=3), "uncompressed EXR, found method 3"),
@@ -193,8 +188,8 @@ def test_rays_meet_a_smooth_sphere_where_geometry_says(formula_terrain):
     uv = np.array([[255.5, 255.5], [400.25, 30.5], [0.0, 511.0]])
     hits = cast(terrain, CAMERA, position, rotation, uv)
     # Heights are single precision and a ray is halved onto the ground to millimetres.
-    np.testing.assert_allclose(np.linalg.norm(hits, axis=1) - MOON_RADIUS_M, 700.0, atol=0.05)
-    np.testing.assert_allclose(CAMERA.project((hits - position) @ rotation.T), uv, atol=1e-3)
+    assert_allclose(norm(hits, axis=1) - MOON_RADIUS_M, 700.0, atol=0.05)
+    assert_allclose(CAMERA.project((hits - position) @ rotation.T), uv, atol=1e-3)
 
 
 def test_a_label_on_a_slope_sits_on_the_slopes_rim(formula_terrain):
@@ -225,7 +220,6 @@ def test_labels_sit_on_procedural_rims_also_through_a_distorting_lens(procedural
 
 @mark.real_data
 def test_labels_sit_on_real_rims(data_path):
-    terrain = open_terrain("raster", find_data(data_path), 3)
-    offsets = errors_px(terrain, -30.0, 294.0, (45e3,))
+    offsets = errors_px(open_terrain("raster", find_data(data_path), 3), -30.0, 294.0, (45e3,))
     assert offsets.size >= 20
     assert sqrt(np.mean(offsets**2)) <= 0.1

@@ -4,6 +4,7 @@ from dataclasses import replace
 from math import cos, degrees, pi, radians, sin, sqrt, tan
 
 import numpy as np
+from numpy.linalg import norm
 from numpy.random import default_rng
 from numpy.testing import assert_allclose, assert_array_equal
 from pytest import approx, fixture, mark, raises
@@ -66,7 +67,7 @@ def test_the_same_generator_gives_the_same_bits_blur_keeps_light_and_ground_is_s
     assert image[[0, 2]] / image[1] == approx([COLOUR[0], COLOUR[2]], abs=0.01)
 
 
-@mark.parametrize(("bits", "steps", "kind"), [(8, 256, "uint8"), (12, 4096, "uint16"), (16, 65536, "uint16")])
+@mark.parametrize("bits, steps, kind", [(8, 256, "uint8"), (12, 4096, "uint16"), (16, 65536, "uint16")])
 def test_depth_limits_the_number_of_levels_and_the_scene_is_left_as_it_was(bits, steps, kind):
     scene = np.linspace(0.0, 1.0, 128 * 128, dtype=np.float32).reshape(128, 128)
     before = scene.copy()
@@ -92,8 +93,7 @@ def green(scene, sensor):
 
 def test_exposure_is_the_share_of_full_scale_and_gain_brightens_and_makes_noisier():
     assert green(field(0.2), quiet(exposure=2.5)).mean() == approx(0.5, abs=1e-3)
-    bright = green(field(0.1), quiet(gain=4.0))
-    assert bright.mean() == approx(0.4, abs=1e-3)
+    assert green(field(0.1), quiet(gain=4.0)).mean() == approx(0.4, abs=1e-3)
     # At the same output level four times the gain is a quarter of the electrons: noise doubles.
     deviations = [
         green(field(0.4 / gain), quiet(gain=gain, full_well_e=10_000.0, read_noise_e=0.0)).std() for gain in (1.0, 4.0)
@@ -118,8 +118,7 @@ def test_vignetting_takes_its_share_smear_follows_columns_and_stray_light_goes_e
 def test_hot_and_uneven_pixels_are_the_same_in_every_frame_and_dark_signal_lifts_a_black_picture():
     sensor = quiet(hot_pixels=1e-3)
     first = shot(field(0.1), sensor, 1)[..., 1] == 65535
-    second = shot(field(0.1), sensor, 2)[..., 1] == 65535
-    assert_array_equal(first, second)
+    assert_array_equal(first, shot(field(0.1), sensor, 2)[..., 1] == 65535)
     # A thousandth of 16,384; two may fall on one place.
     assert 14 <= first.sum() <= 16
     sensor = quiet(full_well_e=1000.0, dark_e=50.0, offset=0.1, read_noise_e=0.0)
@@ -130,7 +129,7 @@ def test_hot_and_uneven_pixels_are_the_same_in_every_frame_and_dark_signal_lifts
 
 
 @mark.parametrize(
-    ("options", "message"),
+    "options, message",
     [
         ({"bits": 10}, "8, 12 or 16 bits, found 10"),
         ({"gain": 0.0}, "gain from 0.001 to 1000, found 0"),
@@ -149,15 +148,14 @@ def test_impossible_sensors_are_refused_by_name(options, message):
 def test_sun_direction_and_angles_are_inverse(latitude_deg, azimuth_deg):
     place = radians(latitude_deg), radians(300.0)
     sun = sun_direction_mcmf(radians(12.0), radians(azimuth_deg), *place)
-    assert np.linalg.norm(sun) == approx(1.0, abs=1e-12)
+    assert norm(sun) == approx(1.0, abs=1e-12)
     elevation, azimuth = sun_angles(sun, *place)
     assert degrees(elevation) == approx(12.0, abs=1e-9)
     assert degrees(azimuth) == approx(azimuth_deg, abs=1e-9)
 
 
 def test_a_sun_in_the_north_points_along_the_moons_axis_at_the_equator():
-    sun = sun_direction_mcmf(0.0, 0.0, 0.0, 1.0)
-    assert_allclose(sun, [0.0, 0.0, 1.0], atol=1e-12)
+    assert_allclose(sun_direction_mcmf(0.0, 0.0, 0.0, 1.0), [0.0, 0.0, 1.0], atol=1e-12)
 
 
 BARREL = {"k1": -0.02, "k2": 1.0e-3, "k3": 1.0e-4, "p1": 1.0e-3, "p2": -5.0e-4}
@@ -205,13 +203,11 @@ def test_both_renderers_see_through_the_same_lens(procedural):
     view = position, rotation, sun_direction_mcmf(radians(9.0), 0.5, *PLACE)
     fast, slow = renderer.render(procedural, camera, *view), raymarch.render(procedural, camera, *view, every=8)
     pinhole = renderer.render(procedural, PinholeCamera(), *view)
-    difference = np.abs(fast.range_m[::8, ::8] - slow.range_m)
-    assert np.median(difference) < 2.0
+    assert np.median(np.abs(fast.range_m[::8, ::8] - slow.range_m)) < 2.0
     # The lens shows: ranges of the undistorted picture differ by kilometres at the edge.
     assert np.percentile(np.abs(fast.range_m - pinhole.range_m), 90) > 500.0
     lit = (fast.lit[::8, ::8] > 0.95) & (slow.lit > 0.95)
-    error = (fast.radiance[::8, ::8] - slow.radiance)[lit]
-    assert sqrt(np.mean(error**2)) <= 0.03 * slow.radiance[lit].mean()
+    assert sqrt(np.mean((fast.radiance[::8, ::8] - slow.radiance)[lit] ** 2)) <= 0.03 * slow.radiance[lit].mean()
 
 
 def test_pictures_through_a_lens_without_distortion_are_those_of_the_pinhole(procedural):
@@ -241,9 +237,7 @@ def test_yaw_turns_image_up_clockwise_and_tilt_leans_toward_it():
     eastward = pointed_camera_from_mcmf(position, 0.0, pi / 2.0)
     # Image up is -y: it was north, now it is the nadir camera's +x, east.
     assert_allclose(-eastward[1], north[0], atol=1e-12)
-    leaning = pointed_camera_from_mcmf(position, 0.1, pi / 2.0)
-    east_part = leaning[2] @ north[0]
-    assert east_part == approx(sin(0.1), abs=1e-12)
+    assert pointed_camera_from_mcmf(position, 0.1, pi / 2.0)[2] @ north[0] == approx(sin(0.1), abs=1e-12)
 
 
 @fixture
@@ -259,8 +253,7 @@ def entry(table, phase_deg):
 def test_every_law_gives_the_albedo_when_sun_and_camera_stand_overhead(law):
     seeliger, lambert, multiple = entry(Photometry(law).tables(), 0.0)
     h_one = 3.0 / (1.0 + 2.0 * sqrt(1.0 - 0.21))
-    normal = 0.5 * seeliger + lambert + 0.5 * multiple * h_one**2
-    assert normal == approx(1.0, abs=2e-3)
+    assert 0.5 * seeliger + lambert + 0.5 * multiple * h_one**2 == approx(1.0, abs=2e-3)
 
 
 def test_lunar_lambert_shares_follow_mcewen():
@@ -273,8 +266,7 @@ def test_lunar_lambert_shares_follow_mcewen():
 @mark.parametrize("law", [law for law in LAWS if law != "matt"])
 def test_brightness_falls_with_phase(law):
     table = Photometry(law).tables()
-    whole = [float(entry(table, phase)[:2].sum()) for phase in (5, 30, 60, 90, 110)]
-    assert np.all(np.diff(whole) < 0.0)
+    assert np.all(np.diff([float(entry(table, phase)[:2].sum()) for phase in (5, 30, 60, 90, 110)]) < 0.0)
 
 
 def test_a_matt_surface_is_as_bright_at_any_phase():
@@ -391,7 +383,7 @@ def test_the_shadow_of_a_step_ends_where_trigonometry_says(formula_terrain):
     # Along the central meridian the ground south of the wall is dark for height / tan(elevation).
     column = picture.lit[:, 255]
     points = position + picture.range_m[:, 255, None] * rays(rotation)[:, 255]
-    latitude = np.arcsin(points[:, 2] / np.linalg.norm(points, axis=1))
+    latitude = np.arcsin(points[:, 2] / norm(points, axis=1))
     dark = (column < 0.5) & (latitude < edge_rad - 100.0 / MOON_RADIUS_M)
     length = (edge_rad - latitude[dark].min()) * MOON_RADIUS_M
     # The crest lies below the tangent plane by the fall of the Moon over its distance from below the camera.
@@ -468,7 +460,7 @@ COUNT = 20_000
 
 @fixture()
 def rng():
-    return np.random.default_rng(4)
+    return default_rng(4)
 
 
 def test_each_class_is_found_with_its_recall_and_no_other_size(rng):
@@ -486,8 +478,7 @@ def test_errors_have_their_size_and_the_lasting_part_stays(rng):
     first, sizes = detector.detect(uv, size, CORNER, rng, lasting)
     second, _ = detector.detect(uv, size, CORNER, rng, lasting)
     assert (first - uv).std() == approx(1.5, rel=0.02)
-    correlation = np.corrcoef((first - uv).reshape(-1), (second - uv).reshape(-1))[0, 1]
-    assert correlation == approx(0.64, abs=0.02)
+    assert np.corrcoef((first - uv).reshape(-1), (second - uv).reshape(-1))[0, 1] == approx(0.64, abs=0.02)
     assert np.log(sizes / size).std() == approx(0.1, rel=0.03)
 
 

@@ -1,6 +1,7 @@
 """Rasters: pixels, registration, detail; and as their publishers write them, from PDS3 to JPEG 2000."""
 
 import math
+from math import radians
 
 import numpy as np
 from numpy.testing import assert_allclose, assert_array_equal
@@ -23,7 +24,7 @@ rasterio, warp = Lazy("rasterio"), Lazy("rasterio.warp")
 MOON = "+proj=longlat +R=1737400 +no_defs"
 NONE = make_catalogue([], [], [], source="none")
 AS_IT_IS = {"sharpen": False, "registration_north_m": 0.0, "smoothing_pixels": 0.0}
-METRES_PER_DEGREE = math.radians(MOON_RADIUS_M)
+METRES_PER_DEGREE = radians(MOON_RADIUS_M)
 
 
 def plane(latitude, longitude):
@@ -97,7 +98,7 @@ def heights_agree(terrain, latitude, longitude, within_m):
 
 
 @mark.parametrize(
-    ("unit", "offset", "middle_deg"), [("KILOMETER", 1737.4, 180.0), ("KILOMETER", 0, 0.0), ("METER", 1_737_400, 0.0)]
+    "unit, offset, middle_deg", [("KILOMETER", 1737.4, 180.0), ("KILOMETER", 0, 0.0), ("METER", 1_737_400, 0.0)]
 )
 def test_the_unit_of_a_label_holds_without_and_with_an_offset(tmp_path, unit, offset, middle_deg):
     """The labels of SLDEM2015 give OFFSET = 1737.4 and kilometres, and count longitudes from 180 degrees."""
@@ -123,7 +124,7 @@ def test_gld100_metres_of_16_bits_with_holes(tmp_path):
     heights_agree(terrain, np.array([17.1, 15.0]), np.array([15.9, 13.0]), 3.0)
     alone = RasterTerrain([fine], NONE, **AS_IT_IS)
     with raises(TerrainError, match=r"expected heights at latitude .*, found none"):
-        alone.height_m(math.radians(15.0), math.radians(13.0))
+        alone.height_m(radians(15.0), radians(13.0))
 
 
 def test_projected_metres_join_across_tiles_whose_pixels_do_not_divide_the_degree(tmp_path):
@@ -178,15 +179,13 @@ def test_reflectance_tiles_are_averaged_over_the_grid_and_relative_to_their_medi
     checks = 0.02 * np.where((np.arange(640)[:, None] + np.arange(640)[None, :]) % 2, 1.0, -1.0)
     values = (np.where(longitude < 305.0, 0.03, 0.06) + checks + 0.0 * latitude).astype("<f4")
     values[:32] = -3.4028227e38  # missing in the archive's floating-point images
-    path = write_pds3(tmp_path / "WAC", values, unit="N/A", west=300.0, north=10.0, ppd=ppd)
-    albedo = open_albedo([path])
+    albedo = open_albedo([write_pds3(tmp_path / "WAC", values, unit="N/A", west=300.0, north=10.0, ppd=ppd)])
     places = np.radians(np.linspace(8.0, 2.0, 13)), np.radians(np.linspace(301.0, 309.0, 17))
     found = albedo.relative(*places)
     median = float(np.median(values[32:][values[32:] > 0]))
     assert_allclose(found[:, :7], 0.03 / median, rtol=0.03)
     assert_allclose(found[:, -7:], 0.06 / median, rtol=0.03)
-    beyond = albedo.relative(np.radians([9.9, 9.8]), np.radians([304.0, 306.0]))
-    assert_array_equal(beyond, 1.0)
+    assert_array_equal(albedo.relative(np.radians([9.9, 9.8]), np.radians([304.0, 306.0])), 1.0)
 
 
 def test_a_folder_with_sldem2015_uses_it_before_gld100(tmp_path):
@@ -268,14 +267,13 @@ def write_form(
     ]
 )  # fmt: skip
 def test_a_form_of_the_same_ground_gives_the_same_heights(tmp_path, form):
-    terrain = RasterTerrain([write_form(tmp_path / "a.tif", **form)], NONE, **AS_IT_IS)
-    found = terrain.height_m(*np.radians(PLACES))
+    found = RasterTerrain([write_form(tmp_path / "a.tif", **form)], NONE, **AS_IT_IS).height_m(*np.radians(PLACES))
     # Half a metre of whole and half metres, and what one pixel of 1.9 km bends.
     assert_allclose(found, ground(*PLACES), atol=1.0)
 
 
 @mark.parametrize(
-    ("form", "message"),
+    "form, message",
     [
         ({"convert": lambda h: h / 1e3}, r"differ by 3 m .* found 0\.\d+ .* no unit stated\): kilometres"),
         ({"convert": lambda h: h * 1e3}, r"expected heights of -9200 to 10800 m .* found -\d+ to \d\.\d+e\+06"),
@@ -293,15 +291,14 @@ def test_a_raster_with_another_unit_zero_or_body_is_refused_with_both_numbers(tm
     path = write_form(tmp_path / "a.tif", **form)
     if message is None:
         # What a file states of its unit counts: this ground is flat, at 1,737 m.
-        found = RasterTerrain([path], NONE, **AS_IT_IS).height_m(*np.radians(PLACES))
-        assert_allclose(found, 1737.4, atol=2.0)
+        assert_allclose(RasterTerrain([path], NONE, **AS_IT_IS).height_m(*np.radians(PLACES)), 1737.4, atol=2.0)
         return
     with raises(TerrainError, match=message):
         RasterTerrain([path], NONE, **AS_IT_IS).height_m(*np.radians(PLACES))
 
 
 @mark.parametrize(
-    ("convert", "message"),
+    "convert, message",
     [
         (lambda h: h, None),
         (lambda h: 2.0 * h, "found 2 times their relief"),
@@ -362,15 +359,14 @@ def test_a_polar_map_holds_the_pole_and_nothing_beyond_its_edge(tmp_path):
 
 
 @mark.parametrize(
-    ("line", "message"),
+    "line, message",
     [
         ('POSITIVE_LONGITUDE_DIRECTION = "WEST"', "expected longitudes to the east, found"),
         ("MAP_PROJECTION_ROTATION = 90.0", "expected MAP_PROJECTION_ROTATION = 0"),
     ],
 )
 def test_a_label_whose_axes_gdal_does_not_read_is_refused(tmp_path, line, message):
-    values = np.zeros((32, 32), "<i2")
-    path = write_pds3(tmp_path / "A", values, "LSB_INTEGER", "METER", 0, 0.0)
+    path = write_pds3(tmp_path / "A", np.zeros((32, 32), "<i2"), "LSB_INTEGER", "METER", 0, 0.0)
     label = path.read_text().replace('POSITIVE_LONGITUDE_DIRECTION = "EAST"', line)
     path.write_text(label)
     with raises(TerrainError, match=message):
@@ -409,7 +405,7 @@ def test_registration_moves_the_raster_over_the_ground(tmp_path):
     path = write_raster(tmp_path / "a.tif", 10.0, 20.0, 8.0, slope)
     moved = RasterTerrain([path], NONE, **(AS_IT_IS | {"registration_north_m": -59.0}))
     still = RasterTerrain([path], NONE, **AS_IT_IS)
-    place = math.radians(15.0), math.radians(14.0)
+    place = radians(15.0), radians(14.0)
     shift_deg = math.degrees(59.0 / MOON_RADIUS_M)
     # What was 59 m farther north is now here: higher, on ground that rises to the north.
     assert float(moved.height_m(*place) - still.height_m(*place)) == approx(100.0 * shift_deg, abs=0.01)
@@ -431,8 +427,7 @@ def test_files_join_without_a_seam_and_across_the_prime_meridian(tmp_path):
         return 500.0 * np.sin(np.radians(8.0 * latitude)) * np.cos(np.radians(9.0 * longitude))
 
     west = write_raster(tmp_path / "w.tif", 352.0, 8.0, 8.0, hills)
-    east = write_raster(tmp_path / "e.tif", 0.0, 8.0, 8.0, hills)
-    terrain = RasterTerrain([west, east], NONE, **AS_IT_IS)
+    terrain = RasterTerrain([west, write_raster(tmp_path / "e.tif", 0.0, 8.0, 8.0, hills)], NONE, **AS_IT_IS)
     longitude = np.linspace(-0.1, 0.1, 41)
     heights = terrain.height_m(np.radians(4.0), np.radians(longitude))
     # Cubic resampling of waves of 40 degrees from pixels of 1/32 degree: centimetres.
@@ -445,10 +440,8 @@ def test_a_coarse_raster_fills_in_around_but_does_not_count_as_covered(tmp_path)
     coarse = write_raster(tmp_path / "c.tif", 0.0, 30.0, 30.0, slope, ppd=8)
     terrain = RasterTerrain([fine], NONE, coarse_paths=[coarse], **AS_IT_IS)
     latitude, longitude = np.array([17.0, 17.0, 12.0]), np.array([13.0, 9.0, 25.0])
-    covered = terrain.covers(np.radians(latitude), np.radians(longitude))
-    assert covered.tolist() == [True, False, False]
-    heights = terrain.height_m(np.radians(latitude), np.radians(longitude))
-    assert_allclose(heights, slope(latitude, longitude), atol=0.5)
+    assert terrain.covers(np.radians(latitude), np.radians(longitude)).tolist() == [True, False, False]
+    assert_allclose(terrain.height_m(np.radians(latitude), np.radians(longitude)), slope(latitude, longitude), atol=0.5)
 
 
 def test_sharpening_is_seeded_and_adds_what_the_raster_cannot_hold(tmp_path):
@@ -524,7 +517,7 @@ class Plane:
         return np.where((y > 20) & (x > 15) & (x < 40), np.nan, 1000.0 * y + x).astype(np.float32)
 
 
-def test_holes_take_the_nearest_height_and_weights_rise_beside_them():
+def test_holes_take_the_nearest_height_and_weights_rise_away_from_them():
     source, hole, weight = _window(Plane(), 0, 0, 50, 60, 3, {})
     assert_array_equal(source[30, 14:18], [30014.0, 30015.0, 30015.0, 30015.0])
     assert_array_equal(source[19:23, 27], [19027.0, 20027.0, 20027.0, 20027.0])

@@ -1,4 +1,5 @@
 import math
+from math import radians
 
 import numpy as np
 from numpy.testing import assert_allclose, assert_array_equal
@@ -16,7 +17,7 @@ def test_the_classes_hold_the_papers_counts(procedural):
 
 
 @mark.parametrize("level", [0, 2])
-@mark.parametrize(("row", "column"), [(16, 7), (18, -1)])
+@mark.parametrize("row, column", [(16, 7), (18, -1)])
 def test_neighbouring_tiles_repeat_each_others_edges(procedural, level, row, column):
     columns = 2 * procedural._level_rows[level]
     ppd = procedural._level_rows[level] * 512 / 180.0
@@ -51,7 +52,7 @@ def test_heights_depend_neither_on_what_was_asked_before_nor_on_the_tiles_that_a
 
 def test_there_is_no_step_at_the_prime_meridian_and_other_seeds_are_other_worlds(procedural):
     latitude = np.radians(np.linspace(9.0, 11.0, 200))
-    step = math.radians(0.5 / 256.0)
+    step = radians(0.5 / 256.0)
     across = procedural.height_m(latitude, 2.0 * math.pi - step) - procedural.height_m(latitude, step)
     nearby = procedural.height_m(latitude, step) - procedural.height_m(latitude, 3.0 * step)
     assert np.sqrt(np.mean(across**2)) < 2.0 * np.sqrt(np.mean(nearby**2)) + 1.0
@@ -62,7 +63,7 @@ def test_there_is_no_step_at_the_prime_meridian_and_other_seeds_are_other_worlds
 
 def test_craters_are_as_deep_as_they_were_drawn(procedural):
     drawn = procedural._shapes
-    latitude, longitude = math.radians(10.0), math.radians(20.0)
+    latitude, longitude = radians(10.0), radians(20.0)
     near = procedural.catalogue.near(latitude, longitude, 90e3)
     near = near[procedural.catalogue.diameter_m[near] > 4e3]
     measured = procedural.measured(near)

@@ -3,6 +3,7 @@
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
+from numpy import cos, pi, radians, sin
 from numpy.testing import assert_allclose
 from pytest import approx, fixture, mark, raises
 
@@ -28,7 +29,7 @@ PERIOD_S = 6600.0
 RADIUS_M = MOON_RADIUS_M + 30_000.0
 START_NS = 1_880_000_000 * 10**9
 NS = 10**9
-BAND_RAD = (np.radians(-60.0), np.radians(60.0))
+BAND_RAD = (radians(-60.0), radians(60.0))
 
 
 def everywhere(latitude, longitude=None):
@@ -38,7 +39,7 @@ def everywhere(latitude, longitude=None):
 def crossings(truth, covers, in_reach=everywhere, direction="ascending", band_rad=BAND_RAD):
     return find_crossings(
         truth, covers, in_reach, not_before_utc_ns=START_NS, latitude_band_rad=band_rad, direction=direction,
-        half_fov_rad=np.radians(60.0)
+        half_fov_rad=radians(60.0)
     )  # fmt: skip
 
 
@@ -65,10 +66,10 @@ def polar_truth():
     start_s = float(tdb_s_from_utc_ns(START_NS))
 
     def state(tdb_s):
-        angle = 2.0 * np.pi * (tdb_s - start_s) / PERIOD_S
+        angle = 2.0 * pi * (tdb_s - start_s) / PERIOD_S
         zero = np.zeros_like(angle)
-        position = RADIUS_M * np.stack([np.cos(angle), zero, np.sin(angle)], axis=-1)
-        velocity = RADIUS_M * 2.0 * np.pi / PERIOD_S * np.stack([-np.sin(angle), zero, np.cos(angle)], axis=-1)
+        position = RADIUS_M * np.stack([cos(angle), zero, sin(angle)], axis=-1)
+        velocity = RADIUS_M * 2.0 * pi / PERIOD_S * np.stack([-sin(angle), zero, cos(angle)], axis=-1)
         return np.concatenate([position, velocity], axis=-1)
 
     return Truth(state, START_NS, START_NS + int(3 * PERIOD_S) * NS, StillMoon())
@@ -76,13 +77,13 @@ def polar_truth():
 
 def test_frames_are_taken_at_the_cadence_within_the_latitude_limit(polar_truth):
     times, latitude = latitudes(polar_truth)
-    assert np.abs(latitude).max() <= np.radians(60.0)
+    assert np.abs(latitude).max() <= radians(60.0)
     assert np.all(np.diff(times) % (15 * NS) == 0)
     # Two thirds of the orbit lie within 60 degrees: 440 frames at 15 s less up to one at each of four edges.
     assert 6600 / 15 * 2 / 3 - 4 <= times.size <= 6600 / 15 * 2 / 3 + 4
 
 
-@mark.parametrize(("direction", "longitude_deg"), [("ascending", 0.0), ("descending", 180.0)])
+@mark.parametrize("direction, longitude_deg", [("ascending", 0.0), ("descending", 180.0)])
 def test_a_window_runs_across_the_band_in_the_wanted_direction(polar_truth, direction, longitude_deg):
     found = crossings(polar_truth, everywhere, direction=direction)[0]
     assert found.observable
@@ -116,7 +117,7 @@ def test_a_window_whose_swath_leaves_the_terrain_is_not_taken_and_tells_the_lati
 def test_crossings_outside_the_longitudes_are_not_observable_and_bands_lie_on_one_side(polar_truth):
     found = crossings(polar_truth, everywhere, lambda longitude: np.degrees(longitude) > 1.0)[0]
     assert not found.in_reach and not found.observable and found.missing_rad.size == 0
-    band_rad = (np.radians(20.0), np.radians(50.0))
+    band_rad = (radians(20.0), radians(50.0))
     _, latitude = latitudes(polar_truth, band_rad)
     assert latitude.min() >= band_rad[0] and latitude.max() <= band_rad[1]
     assert np.degrees(latitude.max() - latitude.min()) > 28.0
@@ -127,14 +128,12 @@ def test_crossings_outside_the_longitudes_are_not_observable_and_bands_lie_on_on
 
 def test_the_attitude_message_carries_attitude_and_sun_and_an_error_turns_the_camera_by_its_size():
     camera_from_mcmf = nadir_camera_from_mcmf(np.array([RADIUS_M, 0.0, 0.0]))
-    sun_mcmf = np.array([0.6, 0.0, 0.8])
-    message = attitude_message(camera_from_mcmf, camera_from_mcmf @ sun_mcmf)
+    message = attitude_message(camera_from_mcmf, camera_from_mcmf @ np.array([0.6, 0.0, 0.8]))
     assert_allclose(matrix_from_quaternion(message[:4]), camera_from_mcmf, atol=1e-12)
     # Camera: x east, y south, z down. The Sun stands 0.6 up and 0.8 north.
     assert_allclose(message[4:], [0.0, -0.8, -0.6], atol=1e-12)
     camera = nadir_camera_from_mcmf(np.array([RADIUS_M, 0.0, 0.0]))
-    turned = perturbed(camera, np.array([0.0, np.radians(2.0), 0.0]))
-    angle = np.arccos((np.trace(turned @ camera.T) - 1.0) / 2.0)
+    angle = np.arccos((np.trace(perturbed(camera, np.array([0.0, radians(2.0), 0.0])) @ camera.T) - 1.0) / 2.0)
     assert np.degrees(angle) == approx(2.0)
     assert perturbed(camera, np.zeros(3)) is camera
 
@@ -248,7 +247,7 @@ def test_every_kind_of_fault_is_read(kind):
 
 
 @mark.parametrize(
-    ("text", "message"),
+    "text, message",
     [
         ("camera_dark", "expected KIND at SECONDS"), ("camera_dark at soon for 3", "expected KIND at SECONDS"),
         ("camera_dark at 5", "expected how long it lasts"), ("meteor at 5", "expected one of camera_dark"),

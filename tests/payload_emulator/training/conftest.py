@@ -1,7 +1,7 @@
 """Crude data sets for the tests: bright-and-dark blobs on a plain, drawn without any renderer."""
 
 import numpy as np
-import pytest
+from pytest import fixture
 
 from payload_emulator.session.world.recipe import Recipe, Source
 from payload_emulator.training.data import dataset as store
@@ -38,8 +38,7 @@ def draw_blobs(rng, u, v, diameter, pits=()):
 
 def write_blob_dataset(folder, frames_per_split, seed=3, pits=()):
     """A data set of blobs in the project's own format, 30 km up over a plain; pits have no labels."""
-    sources = tuple(Source(name, name, "procedural", 1.0) for name in frames_per_split)
-    recipe = Recipe("blobs", seed, sources)
+    recipe = Recipe("blobs", seed, tuple(Source(name, name, "procedural", 1.0) for name in frames_per_split))
     for name in ("images", "metadata", "shards"):
         (folder / name).mkdir(parents=True)
     hashes, number = {}, 0
@@ -91,11 +90,11 @@ def write_blob_dataset(folder, frames_per_split, seed=3, pits=()):
     return store.Dataset(folder)
 
 
-@pytest.fixture(scope="session")
+@fixture(scope="session")
 def blob_dataset(tmp_path_factory):
     return write_blob_dataset(tmp_path_factory.mktemp("blobs") / "set", {"train": 24, "val": 6, "test": 4})
 
 
-@pytest.fixture(scope="session")
+@fixture(scope="session")
 def make_blob_dataset():
     return write_blob_dataset

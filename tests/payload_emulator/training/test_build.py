@@ -9,10 +9,13 @@ import resource
 import subprocess
 import sys
 import time
+from math import pi, radians
 from pathlib import Path
 
 import numpy as np
-import pytest
+from numpy import cos, hypot, sin
+from numpy.testing import assert_allclose, assert_array_equal
+from pytest import fixture, mark, raises
 
 from lunar.boxes import Box
 from lunar.camera import PinholeCamera
@@ -74,7 +77,7 @@ def empty_set(folder):
     return folder
 
 
-@pytest.fixture(scope="module")
+@fixture(scope="module")
 def built(tmp_path_factory):
     folder = tmp_path_factory.mktemp("built") / "set"
     list(made(folder))
@@ -114,8 +117,7 @@ def test_a_build_killed_at_work_goes_on_to_the_same_bytes(built, tmp_path):
             time.sleep(0.02)
         first.kill()
     (target / "images" / ".000002.png.4711").write_bytes(b"half a picture")
-    done = len(list(target.glob("shards/*.npz")))
-    assert 1 <= done < 4
+    assert 1 <= len(list(target.glob("shards/*.npz"))) < 4
     list(build(load_recipe(recipe), target, 3, find_data(None)))
     assert check(target) == []
     ours, theirs = ({p.relative_to(f): p.read_bytes() for p in f.rglob("*") if p.is_file()} for f in (built, target))
@@ -130,7 +132,7 @@ def test_a_full_disk_loses_nothing_that_was_finished(tmp_path):
     try:
         # A picture has more than a hundred thousand octets.
         resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, limits[1]))
-        with pytest.raises(DatasetError, match=r"File too large.*; 1 of 4 frames are kept, the same command goes on"):
+        with raises(DatasetError, match=r"File too large.*; 1 of 4 frames are kept, the same command goes on"):
             list(steps)
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
@@ -140,14 +142,14 @@ def test_a_full_disk_loses_nothing_that_was_finished(tmp_path):
 
 def test_a_dead_worker_is_said_in_one_line(tmp_path, monkeypatch):
     monkeypatch.setattr("payload_emulator.training.data.build._follow_parent", functools.partial(os._exit, 9))
-    with pytest.raises(DatasetError, match=r"a worker process died .*; 0 of 4 frames are kept"):
+    with raises(DatasetError, match=r"a worker process died .*; 0 of 4 frames are kept"):
         list(made(tmp_path / "set", 2))
 
 
 def test_two_builds_do_not_write_to_one_folder(tmp_path):
     steps = made(tmp_path / "set")
     assert next(steps) == (0, 4)
-    with pytest.raises(DatasetError, match="found a build in progress"):
+    with raises(DatasetError, match="found a build in progress"):
         next(made(tmp_path / "set"))
     steps.close()
     assert next(made(tmp_path / "set")) == (0, 4)
@@ -178,8 +180,7 @@ def test_metadata_tell_pose_corners_and_sun(built):
     document = json.loads((built / "metadata" / "000003.json").read_text())
     for key in ("latitude_deg", "longitude_deg", "altitude_km", "tilt_deg", "azimuth_deg", "corners_deg"):
         assert key in document
-    rotation = np.array(document["camera_from_mcmf"])
-    np.testing.assert_allclose(rotation @ document["sun_mcmf"], document["sun_camera"], atol=1e-12)
+    assert_allclose(np.array(document["camera_from_mcmf"]) @ document["sun_mcmf"], document["sun_camera"], atol=1e-12)
     assert len(document["corners_deg"]) == 4
 
 
@@ -190,8 +191,8 @@ def test_ellipses_of_coco_lie_in_their_boxes(built):
     for a in annotations:
         u, v, half_major, half_minor, angle_deg = a["ellipse"]
         angle, around = np.radians(angle_deg), np.linspace(0.0, 2.0 * np.pi, 181)
-        x = u + half_major * np.cos(around) * np.cos(angle) - half_minor * np.sin(around) * np.sin(angle) + 0.5
-        y = v + half_major * np.cos(around) * np.sin(angle) + half_minor * np.sin(around) * np.cos(angle) + 0.5
+        x = u + half_major * cos(around) * cos(angle) - half_minor * sin(around) * sin(angle) + 0.5
+        y = v + half_major * cos(around) * sin(angle) + half_minor * sin(around) * cos(angle) + 0.5
         assert half_major >= half_minor > 0.0 and 0.0 < a["visible"] <= 1.0
         left, top, width, height = a["bbox"]
         assert min(left, top) >= 0.0 and max(left + width, top + height) <= RECIPE.width_px + 0.01
@@ -200,25 +201,25 @@ def test_ellipses_of_coco_lie_in_their_boxes(built):
         whole += 1
         box = [x.min(), y.min(), np.ptp(x), np.ptp(y)]
         # Rounded to a hundredth of a pixel and of a degree, and looked at every two degrees.
-        np.testing.assert_allclose(box, a["bbox"], atol=0.03 + 2e-4 * half_major)
+        assert_allclose(box, a["bbox"], atol=0.03 + 2e-4 * half_major)
     assert whole >= 10
 
 
 def test_another_data_set_in_the_folder_is_refused(built):
-    with pytest.raises(DatasetError, match="expected an empty folder or the same data set"):
+    with raises(DatasetError, match="expected an empty folder or the same data set"):
         list(made(built, seed=8))
 
 
 def test_other_files_in_the_folder_are_left_alone(tmp_path):
     (tmp_path / "letter.txt").write_text("mine")
-    with pytest.raises(DatasetError, match="found other files"):
+    with raises(DatasetError, match="found other files"):
         list(made(tmp_path))
     assert (tmp_path / "letter.txt").read_text() == "mine"
 
 
 def test_real_terrain_without_data_is_refused(tmp_path):
     recipe = load_recipe(ROOT / "scenarios" / "detector-dataset.toml")
-    with pytest.raises(DatasetError, match="expected terrain tiles"):
+    with raises(DatasetError, match="expected terrain tiles"):
         list(build(recipe, tmp_path / "set", 40, find_data(None)))
 
 
@@ -228,7 +229,7 @@ def test_labels_of_fresh_craters_sit_on_dark_and_bright_walls(built):
     contrast = []
     for frame in dataset.frames():
         image = dataset.image(frame).astype(float)
-        toward = frame.sun_camera[:2] / np.hypot(*frame.sun_camera[:2])
+        toward = frame.sun_camera[:2] / hypot(*frame.sun_camera[:2])
         c = frame.craters
         for k in np.flatnonzero((c["depth_ratio"] > 0.08) & (c["diameter_px"] > 12) & (c["id"] >= 0)):
             step = 0.3 * c["diameter_px"][k] * toward
@@ -240,7 +241,7 @@ def test_labels_of_fresh_craters_sit_on_dark_and_bright_walls(built):
     assert np.mean(np.array(contrast) > 0) > 0.85
 
 
-@pytest.mark.real_data
+@mark.real_data
 def test_training_frames_keep_sixty_kilometres_from_every_held_out_box(tmp_path, data_path):
     recipe = load_recipe(ROOT / "scenarios" / "detector-dataset.toml")
     empty_set(tmp_path)
@@ -249,15 +250,14 @@ def test_training_frames_keep_sixty_kilometres_from_every_held_out_box(tmp_path,
     make_shard(recipe, shard, tmp_path, str(data_path))
     km_per_degree = 1737.4 * np.pi / 180.0
     for path in (tmp_path / "metadata").glob("*.json"):
-        corners = json.loads(path.read_text())["corners_deg"]
-        for corner in corners:
+        for corner in json.loads(path.read_text())["corners_deg"]:
             for box in shard.source.avoid:
                 middle = 0.5 * (box.west_deg + box.east_deg)
                 east = abs((corner["longitude"] - middle + 180) % 360 - 180) - 0.5 * (box.east_deg - box.west_deg)
-                east_km = max(east, 0.0) * km_per_degree * np.cos(np.radians(corner["latitude"]))
+                east_km = max(east, 0.0) * km_per_degree * cos(np.radians(corner["latitude"]))
                 north = max(box.south_deg - corner["latitude"], corner["latitude"] - box.north_deg, 0.0)
                 # A parallel is no great circle: up to 1 % short over such distances.
-                assert np.hypot(east_km, north * km_per_degree) >= 59.4
+                assert hypot(east_km, north * km_per_degree) >= 59.4
 
 
 def test_the_renderers_of_a_recipe_get_the_same_scenes_and_an_unknown_one_is_refused(tmp_path):
@@ -268,22 +268,22 @@ def test_the_renderers_of_a_recipe_get_the_same_scenes_and_an_unknown_one_is_ref
         make_shard(dataclasses.replace(RECIPE, renderer=name), shard, folder, "")
         frames[name] = store.load_shard(folder / "shards" / f"{shard.name}.npz")
     fast, slow = frames["fast"], frames["raymarch"]
-    np.testing.assert_array_equal(fast.position_mcmf_m, slow.position_mcmf_m)
-    np.testing.assert_array_equal(fast.sun_camera, slow.sun_camera)
+    assert_array_equal(fast.position_mcmf_m, slow.position_mcmf_m)
+    assert_array_equal(fast.sun_camera, slow.sun_camera)
     assert fast.image_sha256 != slow.image_sha256
-    with pytest.raises(ScenarioError, match="expected one of fast, raymarch, cycles, found 'pov'"):
+    with raises(ScenarioError, match="expected one of fast, raymarch, cycles, found 'pov'"):
         list(made(tmp_path / "x", renderer="pov"))
 
 
 def test_a_build_by_cycles_without_blender_says_what_is_missing(tmp_path):
-    with pytest.raises(RendererError, match="expected a Python interpreter with Blender"):
+    with raises(RendererError, match="expected a Python interpreter with Blender"):
         list(made(tmp_path / "x", 1, str(tmp_path / "none"), renderer="cycles"))
 
 
 START = parse_utc("2029-08-07T00:00:00Z")
 RADIUS_M = 1_737_400.0 + 30_000.0
-PERIOD_S = 2.0 * math.pi * math.sqrt(RADIUS_M**3 / 4.902_800e12)
-CAMERA = PinholeCamera(512, 512, math.radians(120.0))
+PERIOD_S = 2.0 * pi * math.sqrt(RADIUS_M**3 / 4.902_800e12)
+CAMERA = PinholeCamera(512, 512, radians(120.0))
 
 
 class Everywhere:
@@ -304,14 +304,14 @@ class Everywhere:
         return int(sample_m > 200.0)
 
 
-@pytest.fixture(scope="module")
+@fixture(scope="module")
 def polar_orbit(tmp_path_factory):
     """One revolution over the poles, a state every 30 s."""
     time_s = np.arange(0.0, PERIOD_S, 30.0)
-    angle = 2.0 * math.pi * time_s / PERIOD_S
-    position = RADIUS_M * np.stack([np.cos(angle), np.zeros_like(angle), np.sin(angle)], axis=1)
-    speed = 2.0 * math.pi * RADIUS_M / PERIOD_S
-    velocity = speed * np.stack([-np.sin(angle), np.zeros_like(angle), np.cos(angle)], axis=1)
+    angle = 2.0 * pi * time_s / PERIOD_S
+    position = RADIUS_M * np.stack([cos(angle), np.zeros_like(angle), sin(angle)], axis=1)
+    speed = 2.0 * pi * RADIUS_M / PERIOD_S
+    velocity = speed * np.stack([-sin(angle), np.zeros_like(angle), cos(angle)], axis=1)
     # Over the Moon's poles, not over the Earth's; the Moon turns by a degree meanwhile.
     icrf_from_mcmf = IauOrientation().mcmf_from_icrf(tdb_s_from_utc_ns(START)).T
     states = position @ icrf_from_mcmf.T, velocity @ icrf_from_mcmf.T
@@ -335,7 +335,7 @@ def test_every_position_within_sixty_degrees_is_taken_and_no_other(polar_orbit):
     assert np.abs(np.degrees(latitude)).max() <= 60.0
     assert np.allclose(altitude, 30_000.0, atol=5.0)
     # Two thirds of a polar revolution of 110 minutes at two frames a minute: 147.
-    with pytest.raises(DatasetError, match=r"expected 200 places .* found 14\d of 2\d\d"):
+    with raises(DatasetError, match=r"expected 200 places .* found 14\d of 2\d\d"):
         laid(source(polar_orbit), 200)
     steps = np.diff(track.utc_ns) / 1e9
     assert set(np.round(steps[steps < 60.0], 6)) == {30.0}
@@ -346,10 +346,9 @@ def test_every_position_within_sixty_degrees_is_taken_and_no_other(polar_orbit):
 def test_places_follow_the_ephemeris_and_not_its_step_within_boxes_and_buffers(polar_orbit):
     fine = laid(source(polar_orbit, step_s=15.0), 40)
     coarse = laid(source(polar_orbit), 20)
-    np.testing.assert_array_equal(fine.utc_ns[::2], coarse.utc_ns)
-    np.testing.assert_allclose(fine.position_mcmf_m[::2], coarse.position_mcmf_m, atol=1e-3)
-    north = source(polar_orbit, boxes=(Box(0.0, 360.0, 10.0, 60.0),), avoid=(Box(0.0, 360.0, 40.0, 50.0),))
-    track = laid(north, 20)
+    assert_array_equal(fine.utc_ns[::2], coarse.utc_ns)
+    assert_allclose(fine.position_mcmf_m[::2], coarse.position_mcmf_m, atol=1e-3)
+    track = laid(source(polar_orbit, boxes=(Box(0.0, 360.0, 10.0, 60.0),), avoid=(Box(0.0, 360.0, 40.0, 50.0),)), 20)
     latitude = np.degrees(spherical_from_mcmf(track.position_mcmf_m)[0])
     # A footprint from 30 km reaches 1.76 degrees to each side at its edge, 2.5 in its corners; the buffer is 60 km.
     assert latitude.min() > 10.0 + 1.7
@@ -372,7 +371,7 @@ def test_an_ephemeris_below_the_ground_is_refused_with_the_place(polar_orbit):
     position = laid(along, 1).position_mcmf_m[0]
     rng = np.random.default_rng(1)
     assert pose_at(Everywhere(), CAMERA, along, position, "frame 3", rng).ground_m == 0.0
-    with pytest.raises(DatasetError, match=r"frame 3: expected a place above the ground at .* found the camera at"):
+    with raises(DatasetError, match=r"frame 3: expected a place above the ground at .* found the camera at"):
         pose_at(Everywhere(31_000.0), CAMERA, along, position, "frame 3", rng)
 
 
@@ -400,7 +399,7 @@ share = 1.0
         (text.replace("16", "12").replace("80/15/5", "train"), "bits: expected one of 8, 16, found 12"),
     ):
         path.write_text(wrong)
-        with pytest.raises(DatasetError, match=message):
+        with raises(DatasetError, match=message):
             load_recipe(path)
 
 
@@ -408,8 +407,7 @@ def test_the_shipped_recipe_of_the_papers_data_set_flies_the_shipped_orbit():
     recipe = load_recipe(ROOT / "scenarios" / "paper-dataset.toml")
     (along,) = recipe.sources
     assert (along.split, along.light, along.step_s, along.days) == ("80/15/5", "paper", 30.0, 30.0)
-    day = dataclasses.replace(along, days=0.1, step_s=60.0)
-    track = laid(day, 60, recipe.seed)
+    track = laid(dataclasses.replace(along, days=0.1, step_s=60.0), 60, recipe.seed)
     altitude_km = spherical_from_mcmf(track.position_mcmf_m)[2] / 1e3
     # The paper's orbit flies between 14.0 and 48.6 km.
     assert altitude_km.min() > 13.0 and altitude_km.max() < 50.0
@@ -418,11 +416,10 @@ def test_the_shipped_recipe_of_the_papers_data_set_flies_the_shipped_orbit():
 def test_places_are_ordered_so_that_neighbours_on_the_ground_follow_each_other():
     """53 revolutions, each 0.3 degrees west of the one before, low on the way north and high on the way south."""
     step = np.arange(20_000)
-    latitude = 0.8 * np.sin(step / 60.0)
-    longitude = -step / 377.0 * math.radians(0.3)
-    altitude_m = np.where(np.cos(step / 60.0) > 0.0, 14e3, 48e3)
-    position = np.asarray(mcmf_from_spherical(latitude, longitude, altitude_m))
-    order = order_by_ground(position, CAMERA, Everywhere())
+    latitude = 0.8 * sin(step / 60.0)
+    longitude = -step / 377.0 * radians(0.3)
+    altitude_m = np.where(cos(step / 60.0) > 0.0, 14e3, 48e3)
+    order = order_by_ground(np.asarray(mcmf_from_spherical(latitude, longitude, altitude_m)), CAMERA, Everywhere())
     assert np.array_equal(np.sort(order), step)
 
     def tiles(order):

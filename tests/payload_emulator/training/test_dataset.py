@@ -1,13 +1,16 @@
 """Data sets on disk: recipes, crops, targets; an exported network made trainable again."""
 
-import json
 import shutil
+from json import dumps, loads
 from pathlib import Path
 
 import numpy as np
-import pytest
+from numpy import array_equal
+from numpy.random import default_rng
+from numpy.testing import assert_allclose, assert_array_equal
 from pycocotools.coco import COCO
 from pycocotools.cocoeval import COCOeval
+from pytest import approx, fixture, mark, raises
 
 from lunar.boxes import Box, inside_box
 from lunar.catalogue import size_class
@@ -27,7 +30,7 @@ from payload_emulator.training.model.export import keep_blocked, onnx_model
 from tests.lazy import Lazy
 
 
-@pytest.fixture
+@fixture
 def copy(blob_dataset, tmp_path):
     shutil.copytree(blob_dataset.folder, tmp_path / "set")
     return tmp_path / "set"
@@ -52,7 +55,7 @@ def test_every_missing_or_damaged_file_is_named(copy):
         assert name in problems
 
 
-@pytest.mark.parametrize("missing", [True, False])
+@mark.parametrize("missing", [True, False])
 def test_a_lost_shard_does_not_hide_the_rest(copy, missing):
     (copy / "images/000025.png").unlink()
     path = copy / "shards/00000.npz"
@@ -67,13 +70,13 @@ def test_a_lost_shard_does_not_hide_the_rest(copy, missing):
 
 def test_a_changed_index_is_found_and_one_of_another_schema_refused(copy):
     path = copy / "dataset.json"
-    index = json.loads(path.read_text())
+    index = loads(path.read_text())
     index["camera"]["fov_deg"] = 119.0
-    path.write_text(json.dumps(index))
+    path.write_text(dumps(index))
     assert any("dataset.json" in problem for problem in check(copy))
     index["schema_version"] = 99
-    path.write_text(json.dumps(index))
-    with pytest.raises(DatasetError, match="schema_version: expected 1, found 99"):
+    path.write_text(dumps(index))
+    with raises(DatasetError, match="schema_version: expected 1, found 99"):
         store.Dataset(copy)
     path.write_text("{")
     assert any("dataset.json: expected a JSON object" in problem for problem in check(copy))
@@ -81,17 +84,17 @@ def test_a_changed_index_is_found_and_one_of_another_schema_refused(copy):
 
 def test_an_unfinished_data_set_is_distinguished_from_none(copy):
     (copy / "dataset.json").unlink()
-    with pytest.raises(DatasetError, match="found none"):
+    with raises(DatasetError, match="found none"):
         check(copy)
     (copy / "recipe.json").write_text("{}")
     for open_it in (check, store.Dataset):
-        with pytest.raises(DatasetError, match="found an unfinished one"):
+        with raises(DatasetError, match="found an unfinished one"):
             open_it(copy)
 
 
 def test_rims_of_older_data_sets_are_round(copy):
     frame = store.Dataset(copy).frames()[0]
-    np.testing.assert_array_equal(frame.craters["major_px"], frame.craters["diameter_px"])
+    assert_array_equal(frame.craters["major_px"], frame.craters["diameter_px"])
     assert set(frame.craters["visible"]) == {1.0}
 
 
@@ -102,7 +105,7 @@ def test_counts_are_compared_with_the_papers(blob_dataset):
     # The paper, section V-B.4: 51,924 frames, 72.8, 16.9 and 10.3 per cent.
     assert figures["paper"]["instances"] == [956_110, 221_860, 135_098]
     assert [round(100 * share, 1) for share in figures["paper"]["shares"]] == [72.8, 16.9, 10.3]
-    assert figures["paper"]["instances_per_frame"][0] == pytest.approx(18.41, abs=0.01)
+    assert figures["paper"]["instances_per_frame"][0] == approx(18.41, abs=0.01)
 
 
 def test_a_sheet_shows_rims_in_the_papers_colours(blob_dataset):
@@ -116,7 +119,7 @@ def test_a_sheet_shows_rims_in_the_papers_colours(blob_dataset):
         assert np.abs(top - colour).sum(axis=1).min() < 250
     sheet = draw_sheet(blob_dataset, "test", columns=2, rows=2, tile_px=128)
     assert sheet.shape == (2 * (128 + 22) + 3 * 4, 2 * 128 + 3 * 4, 3)  # captions of 22 px, gaps of 4
-    with pytest.raises(DatasetError, match="expected frames of split 'night', found none"):
+    with raises(DatasetError, match="expected frames of split 'night', found none"):
         draw_sheet(blob_dataset, "night")
 
 
@@ -125,7 +128,7 @@ def test_sixteen_bits_are_stored_and_read_as_eight(tmp_path):
     store.write_frame(tmp_path / "a.png", deep)
     import cv2
 
-    np.testing.assert_array_equal(cv2.imread(str(tmp_path / "a.png"), cv2.IMREAD_UNCHANGED), deep)
+    assert_array_equal(cv2.imread(str(tmp_path / "a.png"), cv2.IMREAD_UNCHANGED), deep)
     # The reader keeps the upper octet, to a rounding.
     assert np.abs(store.read_gray(tmp_path / "a.png").astype(int) - (deep >> 8)).max() <= 1
 
@@ -136,7 +139,7 @@ def test_nothing_half_written_stays_when_the_disk_is_full(tmp_path, monkeypatch)
         raise OSError(28, "No space left on device", str(path))
 
     monkeypatch.setattr("pathlib.Path.write_bytes", full)
-    with pytest.raises(OSError, match="No space left"):
+    with raises(OSError, match="No space left"):
         store.write_json(tmp_path / "a.json", {})
     assert list(tmp_path.iterdir()) == []
 
@@ -151,7 +154,7 @@ def test_changed_labels_are_found_by_their_hash(copy):
 
 def test_a_damaged_shard_is_refused(copy):
     (copy / "shards/00001.npz").write_bytes(b"PK damaged")
-    with pytest.raises(DatasetError, match=r"00001\.npz"):
+    with raises(DatasetError, match=r"00001\.npz"):
         store.Dataset(copy)
 
 
@@ -160,9 +163,9 @@ def far_corner(annotation):
     return x + w, y + h
 
 
-@pytest.mark.parametrize("split", ["train", "val", "test"])
+@mark.parametrize("split", ["train", "val", "test"])
 def test_coco_has_the_fields_that_its_readers_need(blob_dataset, split):
-    coco = json.loads((blob_dataset.folder / f"coco_{split}.json").read_text())
+    coco = loads((blob_dataset.folder / f"coco_{split}.json").read_text())
     assert set(coco) == {"info", "licenses", "images", "annotations", "categories"}
     images = {image["id"]: image for image in coco["images"]}
     numbers = [frame.number for frame in blob_dataset.frames(split)]
@@ -179,7 +182,7 @@ def test_coco_has_the_fields_that_its_readers_need(blob_dataset, split):
         (ring,) = a["segmentation"]
         points = np.array(ring).reshape(-1, 2)
         assert len(points) >= 3 and points.min() >= 0.0 and points.max() <= 512.0
-        np.testing.assert_allclose([*points.min(axis=0), *np.ptp(points, axis=0)], a["bbox"], atol=0.015)
+        assert_allclose([*points.min(axis=0), *np.ptp(points, axis=0)], a["bbox"], atol=0.015)
         assert 0.0 < a["area"] <= w * h
         assert names[a["category_id"]] in ("5-10 km", "10-15 km")  # blobs are 5.3 to 10.1 km wide
 
@@ -188,23 +191,24 @@ def test_an_ellipse_in_the_image_keeps_its_box_and_area():
     # Half-axes 20 and 10, turned by 30 degrees: half extents sqrt(300 + 25) and sqrt(100 + 75).
     rim = clipped(ellipse_polygon(100.0, 50.0, 20.0, 10.0, np.radians(30.0)), 512, 512)
     half = np.sqrt([325.0, 175.0])
-    np.testing.assert_allclose(rim.min(axis=0), np.array([100.0, 50.0]) - half, atol=1e-9)
-    np.testing.assert_allclose(rim.max(axis=0), np.array([100.0, 50.0]) + half, atol=1e-9)
-    assert polygon_area(rim) == pytest.approx(np.pi * 200.0, rel=0.0065)
+    assert_allclose(rim.min(axis=0), np.array([100.0, 50.0]) - half, atol=1e-9)
+    assert_allclose(rim.max(axis=0), np.array([100.0, 50.0]) + half, atol=1e-9)
+    assert polygon_area(rim) == approx(np.pi * 200.0, rel=0.0065)
 
 
-@pytest.mark.parametrize(
-    ("centre", "box", "share"),
-    [
-        ((0.0, 40.0), (0.0, 30.0, 10.0, 50.0), 0.5), ((200.0, 40.0), (190.0, 30.0, 200.0, 50.0), 0.5),
-        ((100.0, 0.0), (90.0, 0.0, 110.0, 10.0), 0.5), ((100.0, 80.0), (90.0, 70.0, 110.0, 80.0), 0.5),
-        ((200.0, 80.0), (190.0, 70.0, 200.0, 80.0), 0.25),
-    ],
-)  # fmt: skip
-def test_a_crater_on_the_border_is_clipped_to_the_image(centre, box, share):
+# centre, box, share of the area
+BORDER = (
+    "0 40 0 30 10 50 .5,200 40 190 30 200 50 .5,100 0 90 0 110 10 .5,100 80 90 70 110 80 .5,200 80 190 70 200 80 .25"
+)
+
+
+@mark.parametrize("row", BORDER.splitlines())
+def test_a_crater_on_the_border_is_clipped_to_the_image(row):
+    *places, share = map(float, row.split())
+    centre, box = places[:2], places[2:]
     rim = clipped(ellipse_polygon(*centre, 10.0, 10.0, 0.0), 200, 80)
-    np.testing.assert_allclose([*rim.min(axis=0), *rim.max(axis=0)], box, atol=1e-9)
-    assert polygon_area(rim) == pytest.approx(share * np.pi * 100.0, rel=0.0065)
+    assert_allclose([*rim.min(axis=0), *rim.max(axis=0)], box, atol=1e-9)
+    assert polygon_area(rim) == approx(share * np.pi * 100.0, rel=0.0065)
 
 
 def test_nothing_is_left_of_a_crater_outside_of_the_image():
@@ -212,21 +216,21 @@ def test_nothing_is_left_of_a_crater_outside_of_the_image():
 
 
 def test_boxes_surround_their_centres_and_the_ground_diameter_undoes_the_projection(blob_dataset):
-    coco = json.loads((blob_dataset.folder / "coco_train.json").read_text())
+    coco = loads((blob_dataset.folder / "coco_train.json").read_text())
     whole = [a for a in coco["annotations"] if min(a["bbox"][:2]) > 0.0 and max(far_corner(a)) < 512.0]
     assert len(whole) > 100
     for a in whole:
         x, y, w, h = a["bbox"]
         # COCO counts from the corner of the first pixel, labels from its centre; both are rounded to 0.01 px.
-        assert x + w / 2 == pytest.approx(a["centre"][0] + 0.5, abs=0.02)
-        assert y + h / 2 == pytest.approx(a["centre"][1] + 0.5, abs=0.02)
+        assert x + w / 2 == approx(a["centre"][0] + 0.5, abs=0.02)
+        assert y + h / 2 == approx(a["centre"][1] + 0.5, abs=0.02)
     frame = blob_dataset.frames("test")[0]
     c = frame.craters
     ground = store.diameter_on_ground_m(blob_dataset, frame, c["u_px"], c["v_px"], c["diameter_px"])
     # Labels of this set were made flat; the curved ground is up to 4 % farther in the corners from 30 km.
-    assert ground == pytest.approx(c["diameter_m"], rel=0.05)
+    assert ground == approx(c["diameter_m"], rel=0.05)
     middle = store.diameter_on_ground_m(blob_dataset, frame, np.array([255.5]), np.array([255.5]), np.array([25.0]))
-    assert middle == pytest.approx(25.0 * 30_000.0 / 147.8017, rel=1e-6)
+    assert middle == approx(25.0 * 30_000.0 / 147.8017, rel=1e-6)
 
 
 def craters(**changes):
@@ -237,8 +241,8 @@ def craters(**changes):
     return {key: np.array([value]) for key, value in base.items()}
 
 
-@pytest.mark.parametrize(
-    ("change", "tier"),
+@mark.parametrize(
+    "change, tier",
     [
         ({}, Tier.LABEL), ({"diameter_m": 1200.0, "id": -4}, Tier.LABEL),
         *(({name: value}, Tier.IGNORE) for name, value in (("depth_ratio", 0.01), ("depth_ratio", np.nan),
@@ -256,12 +260,12 @@ def test_deeper_craters_weigh_more():
     assert shallow < deep == 1.0
 
 
-@pytest.mark.filterwarnings("ignore:__array__ implementation:DeprecationWarning")  # of pycocotools itself
+@mark.filterwarnings("ignore:__array__ implementation:DeprecationWarning")  # of pycocotools itself
 def test_pycocotools_reads_the_annotations_and_scores_them_as_perfect(blob_dataset, capsys):
     path = blob_dataset.folder / "coco_train.json"
     truth = COCO(str(path))
     annotations = truth.loadAnns(truth.getAnnIds())
-    assert len(annotations) == len(json.loads(path.read_text())["annotations"]) > 0
+    assert len(annotations) == len(loads(path.read_text())["annotations"]) > 0
     for one in annotations:
         # The mask lies in the image and in the box, to the pixel, and fills the area.
         mask = truth.annToMask(one)
@@ -296,24 +300,23 @@ def spot_image(u, v):
     return np.clip(image, 0, 255).astype(np.uint8)
 
 
-@pytest.mark.parametrize("sun", [(0.0, -1.0, 0.0), (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (-1.0, 0.1, 0.0)])
-@pytest.mark.parametrize("seed", [0, 1, 2])
+@mark.parametrize("sun", [(0.0, -1.0, 0.0), (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (-1.0, 0.1, 0.0)])
+@mark.parametrize("seed", [0, 1, 2])
 def test_a_spot_lands_where_the_label_says(sun, seed):
     u, v = np.array([250.0, 330.0]), np.array([200.0, 280.0])
     crop = make_crop(
         spot_image(u, v), np.array(sun), u, v, np.full(2, 20.0), np.array([True, True]), 384, QUIET,
-        np.random.default_rng(seed),
+        default_rng(seed),
     )  # fmt: skip
     for x, y in zip(crop.u_px, crop.v_px, strict=True):
         if not (12 < x < 371 and 12 < y < 371):
             continue
         i, j = round(float(y)), round(float(x))
-        window = crop.image[i - 8 : i + 9, j - 8 : j + 9].astype(float)
-        weight = np.clip(window - np.median(crop.image), 0, None)
+        weight = np.clip(crop.image[i - 8 : i + 9, j - 8 : j + 9].astype(float) - np.median(crop.image), 0, None)
         rows, columns = np.mgrid[i - 8 : i + 9, j - 8 : j + 9]
         # Half a pixel: rounding to 8 bits and clipping of the spot's core shift its centroid by less.
-        assert (columns * weight).sum() / weight.sum() == pytest.approx(x, abs=0.5)
-        assert (rows * weight).sum() / weight.sum() == pytest.approx(y, abs=0.5)
+        assert (columns * weight).sum() / weight.sum() == approx(x, abs=0.5)
+        assert (rows * weight).sum() / weight.sum() == approx(y, abs=0.5)
 
 
 def test_the_sun_is_at_the_top_of_every_crop_and_one_seed_gives_one_crop():
@@ -322,7 +325,7 @@ def test_the_sun_is_at_the_top_of_every_crop_and_one_seed_gives_one_crop():
     assert bright_right[:, -1].mean() > bright_right[:, 0].mean()
     crop = make_crop(
         bright_right, np.array([1.0, 0.0, 0.0]), np.zeros(0), np.zeros(0), np.zeros(0), np.zeros(0, bool), 384,
-        QUIET, np.random.default_rng(3),
+        QUIET, default_rng(3),
     )  # fmt: skip
     assert crop.image[:40].mean() > crop.image[-40:].mean() + 0.5
     image = spot_image([100, 300], [100, 300])
@@ -330,9 +333,9 @@ def test_the_sun_is_at_the_top_of_every_crop_and_one_seed_gives_one_crop():
         image, np.array([0.0, -1.0, 0.0]), np.array([100.0]), np.array([100.0]), np.array([20.0]), np.array([True]),
         256, AugmentParameters(),
     )  # fmt: skip
-    first, second = (make_crop(*arguments, np.random.default_rng(9)) for _ in range(2))
-    assert np.array_equal(first.image, second.image)
-    assert np.array_equal(first.u_px, second.u_px)
+    first, second = (make_crop(*arguments, default_rng(9)) for _ in range(2))
+    assert array_equal(first.image, second.image)
+    assert array_equal(first.u_px, second.u_px)
 
 
 def targets(u, v, diameter, tiers=Tier.LABEL, weight=1.0, *classes):
@@ -343,12 +346,11 @@ def targets(u, v, diameter, tiers=Tier.LABEL, weight=1.0, *classes):
 
 def perfect_maps(*places):
     t = targets(*places)
-    geometry = np.concatenate([t.geometry, np.zeros((1, 128, 128), np.float32)])
-    return t, geometry
+    return t, np.concatenate([t.geometry, np.zeros((1, 128, 128), np.float32)])
 
 
 def test_decoding_the_targets_returns_the_craters():
-    rng = np.random.default_rng(1)
+    rng = default_rng(1)
     u = np.array([20.3, 100.0, 255.5, 333.9, 480.2])
     v = np.array([30.7, 200.1, 255.5, 90.4, 470.9])
     diameter = rng.uniform(12.0, 120.0, 5)
@@ -356,9 +358,9 @@ def test_decoding_the_targets_returns_the_craters():
     found = decode(t.heat[0], geometry, 0.99)
     order = np.argsort(found.u_px)
     # The mean over nine cells is exact where all nine point at one centre; float32 offsets leave 1e-5 px.
-    assert found.u_px[order] == pytest.approx(u, abs=1e-3)
-    assert found.v_px[order] == pytest.approx(v, abs=1e-3)
-    assert found.diameter_px[order] == pytest.approx(diameter, rel=1e-4)
+    assert found.u_px[order] == approx(u, abs=1e-3)
+    assert found.v_px[order] == approx(v, abs=1e-3)
+    assert found.diameter_px[order] == approx(diameter, rel=1e-4)
 
 
 def test_an_ignored_crater_takes_only_its_own_loss_away_and_class_maps_follow_the_common_one():
@@ -367,7 +369,7 @@ def test_an_ignored_crater_takes_only_its_own_loss_away_and_class_maps_follow_th
     assert t.negative[0, 25, 50] == 0.0
     assert t.negative[0, 25, 80] == 1.0
     t = targets([200, 206], [100, 100], [60, 40], [Tier.IGNORE, Tier.LABEL], [1.0, 0.7])
-    assert t.weight.max() == pytest.approx(0.7)
+    assert t.weight.max() == approx(0.7)
     t = targets([100, 300], [100, 300], [40, 60], Tier.LABEL, 1.0, np.array([0, 3], np.int8))
     assert [one.max() for one in t.heat[1:]] == [1.0, 0.0, 0.0]
     assert (t.heat[0] == 1.0).sum() == 2
@@ -379,7 +381,7 @@ def test_heat_falls_with_distance_in_units_of_the_radius_and_no_craters_give_non
     t, _ = perfect_maps([257.5], [257.5], [80.0])
     # sigma = 0.22 R = 2.2 cells: one sigma away exp(-1/2).
     assert t.heat[0, 64, 64] == 1.0
-    assert t.heat[0, 64, 66] == pytest.approx(np.exp(-0.5 * (2 / 2.2) ** 2), rel=1e-5)
+    assert t.heat[0, 64, 66] == approx(np.exp(-0.5 * (2 / 2.2) ** 2), rel=1e-5)
 
 
 ROOT = Path(__file__).parents[3]
@@ -402,8 +404,8 @@ share = 1.0
 """
 
 
-@pytest.mark.parametrize(
-    ("old", "new", "message"),
+@mark.parametrize(
+    "old, new, message",
     [
         ("seed = 1", "seed = 1\nsead = 2", r"unknown key 'sead' \(did you mean 'seed'\?\)"),
         ('split = "train"', 'split = "trane"', "expected one of train, val, test"),
@@ -414,7 +416,7 @@ share = 1.0
     ],
 )
 def test_a_wrong_recipe_is_refused_in_one_line_that_says_where(tmp_path, old, new, message):
-    with pytest.raises(DatasetError, match=message) as caught:
+    with raises(DatasetError, match=message) as caught:
         load_recipe(write(tmp_path, GOOD.replace(old, new, 1)))
     assert "recipe.toml" in str(caught.value)
 
@@ -447,14 +449,12 @@ def test_a_footprint_near_a_forbidden_box_is_refused_also_over_the_zero_meridian
     places = ((0.0, 284.0), (0.0, 283.1), (0.0, 282.9), (58.0, 281.5))
     found = [bool(allowed(source, world, np.array([north]), np.array([east]))) for north, east in places]
     assert found == [False, False, True, False]
-    box = Box(350.0, 370.0, -10.0, 10.0)
-    inside = inside_box(box, np.zeros(4), np.array([355.0, 5.0, 12.0, 349.0]), 0.0)
+    inside = inside_box(Box(350.0, 370.0, -10.0, 10.0), np.zeros(4), np.array([355.0, 5.0, 12.0, 349.0]), 0.0)
     assert inside.tolist() == [True, True, False, False]
 
 
 def test_shards_hold_every_frame_once_and_each_source_its_share():
-    recipe = procedural_recipe()
-    shards = plan_shards(recipe, 300)
+    shards = plan_shards(procedural_recipe(), 300)
     assert [n for s in shards for n in s.frame_numbers] == list(range(300))
     assert sum(s.frames for s in shards if s.source.split == "train") == 240
 
@@ -467,7 +467,7 @@ def test_real_terrain_may_be_taken_without_what_is_stamped_on_it(tmp_path):
     assert "sharpen" not in sharpened.to_dict()["sources"][0]
     assert plain.digest != sharpened.digest
     for text in (f"{GOOD}sharpen = false\n", f"{real}sharpen = 3\n"):
-        with pytest.raises(DatasetError, match="sharpen: expected true or false"):
+        with raises(DatasetError, match="sharpen: expected true or false"):
             load_recipe(write(tmp_path, text))
 
 
@@ -480,11 +480,11 @@ class Crops:
     """Stands in for the feeder: seeded images of another brightness than unit deviation."""
 
     def batch(self, first, count):
-        rng = np.random.default_rng(first)
+        rng = default_rng(first)
         return {"image": 1.7 * rng.standard_normal((count, 1, 64, 64)).astype(np.float32) + 0.4}
 
 
-@pytest.fixture()
+@fixture()
 def shipped(tmp_path):
     path = tmp_path / "m.onnx"
     path.write_bytes(load_shipped_model())
@@ -499,12 +499,12 @@ def outputs(network, image):
 
 def test_the_restored_network_gives_what_the_exported_one_gives(shipped):
     network, document = restoring.network_from_onnx(shipped)
-    image = np.random.default_rng(1).standard_normal((1, 1, 512, 512)).astype(np.float32)
+    image = default_rng(1).standard_normal((1, 1, 512, 512)).astype(np.float32)
     heat, geometry = outputs(network, image)
     expected = OnnxDetector(shipped.read_bytes()).run_network(image)
     # Single precision through 67 layers: the limit that the export itself holds to.
-    np.testing.assert_allclose(heat, expected[0], atol=2e-4)
-    np.testing.assert_allclose(geometry, expected[1], atol=2e-4)
+    assert_allclose(heat, expected[0], atol=2e-4)
+    assert_allclose(geometry, expected[1], atol=2e-4)
     assert document["progress"]["step"] == 5095  # in the metadata of the shipped network
 
 
@@ -515,20 +515,20 @@ def test_counted_statistics_leave_outputs_and_make_training_mode_agree(shipped):
     before = outputs(network, image)
     restoring.count_statistics(network, Crops(), average, crops=32)
     after = outputs(network, image)
-    np.testing.assert_allclose(after[0], before[0], atol=2e-4)
-    np.testing.assert_allclose(after[1], before[1], atol=2e-3)
-    np.testing.assert_allclose(outputs(average, image)[0], after[0], atol=1e-6)
+    assert_allclose(after[0], before[0], atol=2e-4)
+    assert_allclose(after[1], before[1], atol=2e-3)
+    assert_allclose(outputs(average, image)[0], after[0], atol=1e-6)
     first = network.stem[1]
     with torch.no_grad():
         seen = network.stem[0](torch.from_numpy(np.concatenate([Crops().batch(k, 1)["image"] for k in range(32)])))
-    np.testing.assert_allclose(first.running_mean.numpy(), seen.mean((0, 2, 3)).numpy(), atol=1e-4)
-    np.testing.assert_allclose(first.running_var.numpy(), seen.var((0, 2, 3), unbiased=False).numpy(), rtol=1e-3)
+    assert_allclose(first.running_mean.numpy(), seen.mean((0, 2, 3)).numpy(), atol=1e-4)
+    assert_allclose(first.running_var.numpy(), seen.var((0, 2, 3), unbiased=False).numpy(), rtol=1e-3)
 
 
 def test_what_is_no_exported_network_is_refused(tmp_path):
     (tmp_path / "text.onnx").write_text("no model")
     for name, found in (("none", ", found no file"), ("text", "")):
-        with pytest.raises(ModelError, match="expected an exported network" + found):
+        with raises(ModelError, match="expected an exported network" + found):
             restoring.network_from_onnx(tmp_path / f"{name}.onnx")
 
 
@@ -541,18 +541,18 @@ def test_an_enlarging_network_gives_maps_of_half_the_stride_and_flies():
     detector = OnnxDetector(model.SerializeToString())
     assert onnx.checker.check_model(model) is None
     assert detector.stride_px == 2
-    image = np.random.default_rng(2).standard_normal((1, 1, 512, 512)).astype(np.float32)
+    image = default_rng(2).standard_normal((1, 1, 512, 512)).astype(np.float32)
     heat, geometry = detector.run_network(image)
     assert heat.shape == (1, 1, 256, 256) and geometry.shape == (1, 5, 256, 256)
-    np.testing.assert_allclose(heat, outputs(network, image)[0], atol=2e-4)
-    with pytest.raises(ModelError, match="expected a divisor of the stride 4, found 3"):
+    assert_allclose(heat, outputs(network, image)[0], atol=2e-4)
+    with raises(ModelError, match="expected a divisor of the stride 4, found 3"):
         networks.ModelConfig(enlarge=3)
 
 
 def test_older_networks_name_the_only_backbone_and_stride():
     assert networks.parse_config({"enlarge": 2, "backbone": "small", "stride_px": 4}) == networks.ModelConfig(enlarge=2)
     for name, known, other in (("backbone", "small", "large"), ("stride_px", 4, 2)):
-        with pytest.raises(ModelError, match=f"expected {name} {known}, found {other!r}"):
+        with raises(ModelError, match=f"expected {name} {known}, found {other!r}"):
             networks.parse_config({name: other})
 
 
@@ -561,17 +561,17 @@ def test_a_peak_of_a_fine_map_lies_in_the_middle_of_its_cell():
     heat[10, 20] = 0.9
     found = decode(heat, np.zeros((5, 256, 256), np.float32), 0.5, 2)
     # Cell 20 of two pixels covers pixels 40 and 41.
-    assert (found.u_px[0], found.v_px[0]) == (pytest.approx(40.5), pytest.approx(20.5))
+    assert (found.u_px[0], found.v_px[0]) == (approx(40.5), approx(20.5))
 
 
 def test_an_enlarging_copy_sees_the_enlarged_image_and_tells_pixels_of_the_image(shipped):
     network, _ = restoring.network_from_onnx(shipped)
-    image = np.random.default_rng(5).standard_normal((1, 1, 128, 128)).astype(np.float32)
+    image = default_rng(5).standard_normal((1, 1, 128, 128)).astype(np.float32)
     large = torch.nn.functional.interpolate(
         torch.from_numpy(image), scale_factor=2.0, mode="bilinear", align_corners=False
     ).numpy()
     heat, geometry = outputs(restoring.enlarging(network, 2), image)
     expected_heat, expected = outputs(network, large)
-    np.testing.assert_allclose(heat, expected_heat, atol=1e-5)
+    assert_allclose(heat, expected_heat, atol=1e-5)
     expected[:, 2:4] -= np.log(2.0)
-    np.testing.assert_allclose(geometry[:, :4], expected[:, :4], atol=1e-4)
+    assert_allclose(geometry[:, :4], expected[:, :4], atol=1e-4)

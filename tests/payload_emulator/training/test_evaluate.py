@@ -4,9 +4,11 @@ import json
 from dataclasses import replace
 
 import numpy as np
-import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from numpy import exp, hypot, isnan, log, pi, radians, sqrt
+from numpy.random import default_rng
+from pytest import approx, fixture, mark, raises
 
 from payload_emulator.errors import DatasetError, ModelError
 from payload_emulator.flight.models import load_shipped_model
@@ -53,12 +55,12 @@ from reports.render import render_html
 from tests.payload_emulator.training.conftest import found_at, truth_of
 
 
-@pytest.fixture(scope="module")
+@fixture(scope="module")
 def detector():
     return open_for_evaluation(load_shipped_model())
 
 
-@pytest.fixture(scope="module")
+@fixture(scope="module")
 def scored(detector, blob_dataset):
     return run(detector, [blob_dataset], "test")
 
@@ -77,8 +79,7 @@ def test_figures_name_their_data_their_level_and_both_ways_of_scoring(detector, 
 
 
 def test_the_report_shows_the_worst_frames_and_says_what_it_lacks(detector, blob_dataset, scored):
-    figures = summary(detector, [blob_dataset], scored, "test")
-    report = detector_report(detector, scored, figures)
+    report = detector_report(detector, scored, summary(detector, [blob_dataset], scored, "test"))
     assert len(report.worst_frames) == 4
     page = render_html(report)
     for words in ("By type of terrain", "By altitude", "By Sun elevation", "Predicted uncertainty", "ignore-aware"):
@@ -88,23 +89,23 @@ def test_the_report_shows_the_worst_frames_and_says_what_it_lacks(detector, blob
 
 
 def test_a_split_without_frames_is_refused(detector, blob_dataset):
-    with pytest.raises(DatasetError, match=r"expected frames of split 'test', source 'none', found none"):
+    with raises(DatasetError, match=r"expected frames of split 'test', source 'none', found none"):
         run(detector, [blob_dataset], "test", "none")
 
 
 def test_frames_of_another_camera_or_field_of_view_are_refused(detector, make_blob_dataset, tmp_path, monkeypatch):
     other = make_blob_dataset(tmp_path / "set", {"test": 1})
     monkeypatch.setitem(detector.metadata, "camera_fov_deg", "90")
-    with pytest.raises(DatasetError, match=r"90 degrees\), found 512 x 512 pixels, 120 degrees"):
+    with raises(DatasetError, match=r"90 degrees\), found 512 x 512 pixels, 120 degrees"):
         run(detector, [other], "test")
     monkeypatch.undo()
     other.index["camera"]["width_px"] = 640
-    with pytest.raises(DatasetError, match=r"expected frames of the detector's camera \(512 x 512"):
+    with raises(DatasetError, match=r"expected frames of the detector's camera \(512 x 512"):
         run(detector, [other], "test")
 
 
 def test_the_papers_variant_needs_the_papers_heatmaps(detector, blob_dataset):
-    with pytest.raises(ModelError, match="three class heatmaps, found 0"):
+    with raises(ModelError, match="three class heatmaps, found 0"):
         detect_by_class(detector, blob_dataset, blob_dataset.frames("test")[0])
 
 
@@ -132,7 +133,7 @@ def test_real_terrain_that_fixed_thresholds_or_weights_counts_as_seen(blob_datas
 ONE_STEP = TrainParameters(minutes=0.0, steps=1, batch=2, crop_px=96, validation_frames=1, replicas=1, detail_blocks=0)
 
 
-@pytest.fixture(scope="module")
+@fixture(scope="module")
 def exported(blob_dataset, tmp_path_factory):
     run = tmp_path_factory.mktemp("export")
     train([blob_dataset], run, ONE_STEP)
@@ -149,14 +150,12 @@ def test_an_exported_network_agrees_with_torch_and_carries_its_origin(exported, 
     assert metadata["training_seed"] == "1"
     assert json.loads(metadata["data"])[0]["labels_sha256"] == blob_dataset.digest
     assert float(metadata["score_threshold"]) == figures["score_threshold"]
-    tested = json.loads(metadata["test_figures"])["test"]
-    assert set(tested) == {"frames", "level", "strict", "ignore_aware"}
+    assert set(json.loads(metadata["test_figures"])["test"]) == {"frames", "level", "strict", "ignore_aware"}
 
 
 def test_the_papers_variant_keeps_its_class_heatmaps_and_is_scored_by_them(exported, blob_dataset):
     octets, _ = exported
-    detector = OnnxDetector(octets)
-    heatmap, geometry = detector.run_network(np.zeros((1, 1, 512, 512), np.float32))
+    heatmap, geometry = OnnxDetector(octets).run_network(np.zeros((1, 1, 512, 512), np.float32))
     assert heatmap.shape[1] == 4 and geometry.shape[1] == 5
     scored = evaluate(octets, blob_dataset, threshold=0.01, paper_classes=True)
     assert [row["size_class"] for row in scored["per_class"]] == [0, 1, 2]
@@ -164,14 +163,14 @@ def test_the_papers_variant_keeps_its_class_heatmaps_and_is_scored_by_them(expor
 
 def test_a_network_without_class_heatmaps_is_no_papers_variant(blob_dataset, tmp_path):
     train([blob_dataset], tmp_path, replace(ONE_STEP, paper_classes=False, depth=False))
-    with pytest.raises(ModelError, match="expected a network with the paper's class heatmaps"):
+    with raises(ModelError, match="expected a network with the paper's class heatmaps"):
         export(tmp_path / "checkpoint.pt", tmp_path / "p.onnx", [], paper_classes=True)
 
 
 HEADER = "latitude_deg,longitude_deg,height_m,diameter_m,sightings,looks,score\n"
 
 
-@pytest.fixture
+@fixture
 def landmarks(tmp_path):
     # 30 km over latitude and longitude 0: 203 m to the pixel, u to the east, v to the south, 30,323 m to the degree.
     place = f"{(255.5 - 150.0) * 203.0 / 30_323:.6f},{(200.0 - 255.5) * 203.0 / 30_323:.6f}"
@@ -185,9 +184,9 @@ def test_landmarks_become_labels_where_they_are_in_view(blob_dataset, landmarks)
     bare = replace(frame, craters={key: values[:0] for key, values in frame.craters.items()})
     taught = with_landmarks(blob_dataset, bare, landmarks)
     # 21 and 11 km from the point below, the ground lies 167 m lower: 0.6 % closer to the middle.
-    assert taught.craters["u_px"][-1] == pytest.approx(255.5 - 55.5 * 0.9944, abs=0.05)
-    assert taught.craters["v_px"][-1] == pytest.approx(255.5 - 105.5 * 0.9944, abs=0.05)
-    assert taught.craters["diameter_px"][-1] == pytest.approx(40.0, rel=0.02)
+    assert taught.craters["u_px"][-1] == approx(255.5 - 55.5 * 0.9944, abs=0.05)
+    assert taught.craters["v_px"][-1] == approx(255.5 - 105.5 * 0.9944, abs=0.05)
+    assert taught.craters["diameter_px"][-1] == approx(40.0, rel=0.02)
     assert taught.craters["id"][-1] > 1_000_000_000
     assert bare.craters["u_px"].size == 0
     away = replace(bare, position_mcmf_m=bare.position_mcmf_m + np.array([0.0, 90_000.0, 0.0]))
@@ -197,14 +196,14 @@ def test_landmarks_become_labels_where_they_are_in_view(blob_dataset, landmarks)
 def test_a_file_that_holds_no_landmarks_is_refused(tmp_path):
     path = tmp_path / "l.csv"
     path.write_text("a,b\n1,2\n")
-    with pytest.raises(DatasetError, match="expected landmarks"):
+    with raises(DatasetError, match="expected landmarks"):
         load_landmarks(path)
 
 
 def shifted_scene(azimuth_deg, shift, number=0):
     """Craters on a grid under a Sun at an image azimuth, every detection off by the same shift (right, down)."""
     u, v = (part.ravel() for part in np.meshgrid(np.arange(60.0, 460.0, 80.0), np.arange(60.0, 460.0, 80.0)))
-    return truth_of(u, v, azimuth=np.radians(azimuth_deg), number=number), found_at(u + shift[0], v + shift[1])
+    return truth_of(u, v, azimuth=radians(azimuth_deg), number=number), found_at(u + shift[0], v + shift[1])
 
 
 def bias_of(*scenes):
@@ -214,8 +213,8 @@ def bias_of(*scenes):
     return octants, bias_overall(tallied, 0.5, truths, octants)
 
 
-@pytest.mark.parametrize(
-    ("azimuth_deg", "shift"),
+@mark.parametrize(
+    "azimuth_deg, shift",
     # Toward a Sun at the top, right, bottom, left: up, right, down, left in an image whose v grows downward.
     [(1.0, (0.0, -0.5)), (91.0, (0.5, 0.0)), (181.0, (0.0, 0.5)), (271.0, (-0.5, 0.0))],
 )
@@ -223,28 +222,27 @@ def test_a_pull_toward_the_sun_is_reported_as_such_wherever_the_sun_is(azimuth_d
     octants, overall = bias_of(shifted_scene(azimuth_deg, shift))
     row = octants[int(azimuth_deg // 45)]
     assert row["pairs"] == overall["pairs"] == 25
-    assert (row["du_px"], row["dv_px"]) == pytest.approx(shift)
+    assert (row["du_px"], row["dv_px"]) == approx(shift)
     # The Sun is one degree past the axis: 0.5 cos 1 and 0.5 sin 1.
-    assert row["toward_sun_px"] == pytest.approx(0.49992, abs=1e-5)
-    assert row["across_sun_px"] == pytest.approx(-0.00873, abs=1e-5)
-    assert row["length_px"] == overall["worst_octant_px"] == pytest.approx(0.5)
+    assert row["toward_sun_px"] == approx(0.49992, abs=1e-5)
+    assert row["across_sun_px"] == approx(-0.00873, abs=1e-5)
+    assert row["length_px"] == overall["worst_octant_px"] == approx(0.5)
 
 
 def test_pulls_that_cancel_over_all_suns_remain_in_their_octants():
     octants, overall = bias_of(shifted_scene(10.0, (0.3, 0.0)), shifted_scene(190.0, (-0.3, 0.0), 1))
-    assert overall["length_px"] == pytest.approx(0.0, abs=1e-12)
-    assert overall["worst_octant_px"] == pytest.approx(0.3)
+    assert overall["length_px"] == approx(0.0, abs=1e-12)
+    assert overall["worst_octant_px"] == approx(0.3)
     # Frames pull in opposite directions: resampling two frames gives anything from -0.3 to 0.3.
-    assert overall["interval_95"]["du_px"] == pytest.approx([-0.3, 0.3])
-    assert octants[0]["interval_95"]["du_px"] == pytest.approx([0.3, 0.3])
-    assert octants[2]["pairs"] == 0 and np.isnan(octants[2]["du_px"])
+    assert overall["interval_95"]["du_px"] == approx([-0.3, 0.3])
+    assert octants[0]["interval_95"]["du_px"] == approx([0.3, 0.3])
+    assert octants[2]["pairs"] == 0 and isnan(octants[2]["du_px"])
 
 
 def test_octants_of_a_few_craters_name_no_worst_one():
     truth, found = shifted_scene(10.0, (2.0, 0.0))
     columns = ("u_px", "v_px", "diameter_px", "diameter_m", "depth_ratio", "ids")
-    few = replace(truth, **{name: getattr(truth, name)[:5] for name in columns})
-    _, overall = bias_of((few, found))
+    _, overall = bias_of((replace(truth, **{name: getattr(truth, name)[:5] for name in columns}), found))
     assert overall["pairs"] == 5 and overall["worst_octant"] is None
 
 
@@ -253,7 +251,7 @@ SHARE = 4e-4
 
 def frames(count=12, share=SHARE, depth_said=True, noise=0.0, seed=0):
     """Frames whose detections lie inward of the rims by a share of the depth, as parallax has it."""
-    rng = np.random.default_rng(seed)
+    rng = default_rng(seed)
     pairs = []
     for _ in range(count):
         n = 30
@@ -269,28 +267,28 @@ def frames(count=12, share=SHARE, depth_said=True, noise=0.0, seed=0):
 
 def test_the_share_put_in_is_the_share_found():
     share, error = fit_parallax(frames())
-    assert share == pytest.approx(SHARE, rel=1e-6) and error < 1e-9
+    assert share == approx(SHARE, rel=1e-6) and error < 1e-9
 
 
 def test_the_standard_error_covers_the_scatter_of_the_fit():
     fits = np.array([fit_parallax(frames(noise=0.5, seed=seed)) for seed in range(12)])
-    assert np.abs(fits[:, 0].mean() - SHARE) < 3 * fits[:, 1].mean() / np.sqrt(12)
+    assert np.abs(fits[:, 0].mean() - SHARE) < 3 * fits[:, 1].mean() / sqrt(12)
     # Twelve fits know their spread to a factor of about 1.5.
-    assert fits[:, 0].std() == pytest.approx(fits[:, 1].mean(), rel=0.6)
+    assert fits[:, 0].std() == approx(fits[:, 1].mean(), rel=0.6)
 
 
 def test_detections_come_back_onto_the_rims():
     for truth, found in frames(2):
         put_right = without_parallax(found, SHARE, truth)
-        assert put_right.u_px == pytest.approx(truth.u_px, abs=1e-6)
-        assert put_right.v_px == pytest.approx(truth.v_px, abs=1e-6)
+        assert put_right.u_px == approx(truth.u_px, abs=1e-6)
+        assert put_right.v_px == approx(truth.v_px, abs=1e-6)
 
 
 def test_a_network_that_tells_no_depth_is_corrected_on_the_whole():
     share, _ = fit_parallax(frames(depth_said=False))
     truth, found = frames(1, depth_said=False)[0]
     before, after = (
-        np.hypot(one.u_px - truth.u_px, one.v_px - truth.v_px).mean()
+        hypot(one.u_px - truth.u_px, one.v_px - truth.v_px).mean()
         for one in (found, without_parallax(found, share, truth))
     )
     assert after < 0.5 * before
@@ -298,7 +296,7 @@ def test_a_network_that_tells_no_depth_is_corrected_on_the_whole():
 
 def test_too_few_craters_give_no_correction():
     share, error = fit_parallax(frames(1)[:1])
-    assert share == 0.0 and np.isnan(error)
+    assert share == 0.0 and isnan(error)
 
 
 def test_the_papers_threshold_is_chosen_over_its_classes_together():
@@ -338,15 +336,14 @@ def test_groups_hold_their_own_frames_and_no_others():
 
 
 def test_a_common_shift_is_the_bias_of_its_sun_octant():
-    part = scene(*GRID, shift=(0.4, -0.2), azimuth=np.radians(100.0))
-    figures = figures_of([part], [LOW])
+    figures = figures_of([scene(*GRID, shift=(0.4, -0.2), azimuth=radians(100.0))], [LOW])
     biased = [row for row in figures["bias_px_by_sun_octant"] if row["pairs"]]
     assert [row["octant"] for row in biased] == [2]
-    assert (biased[0]["du_px"], biased[0]["dv_px"]) == pytest.approx((0.4, -0.2))
+    assert (biased[0]["du_px"], biased[0]["dv_px"]) == approx((0.4, -0.2))
 
 
 def test_sigma_is_called_calibrated_where_errors_follow_it():
-    rng = np.random.default_rng(4)
+    rng = default_rng(4)
     u, v = rng.uniform(30, 480, 4000), rng.uniform(30, 480, 4000)
     parts = []
     for k in range(40):
@@ -355,16 +352,15 @@ def test_sigma_is_called_calibrated_where_errors_follow_it():
         parts.append((truth, replace(found, u_px=found.u_px + error_u, v_px=found.v_px + error_v)))
     calibration = figures_of(parts, [LOW] * 40)["sigma_calibration"]
     # 80 draws: the rms of a unit Gaussian is known to 1 / sqrt(160) = 0.08.
-    assert calibration["rms"] == pytest.approx(1.0, abs=0.25)
+    assert calibration["rms"] == approx(1.0, abs=0.25)
     assert calibration["by_altitude_km"][0]["pairs"] == 40
 
 
 def test_states_said_are_counted_against_the_terrains_own():
     fresh = scene([100, 200], [100, 200], depth=0.15, said=0.15)
-    wrong = scene([100], [100], depth=0.15, said=0.03)
-    state = figures_of([fresh, wrong], [LOW, LOW])["degradation_state"]
+    state = figures_of([fresh, scene([100], [100], depth=0.15, said=0.03)], [LOW, LOW])["degradation_state"]
     assert state["confusion"] == [[0, 0, 0], [0, 0, 0], [1, 0, 2]]
-    assert state["agreement"] == pytest.approx(2 / 3)
+    assert state["agreement"] == approx(2 / 3)
 
 
 def test_thresholds_of_three_purposes_are_scored_side_by_side():
@@ -384,7 +380,7 @@ def test_average_precision_of_a_ranking_done_by_hand():
     # Ranked right, wrong, right over 2 craters: areas 0.5 * 1 + 0.5 * 2/3.
     truth, _ = scene([100, 200], [100, 200])
     found = found_at([100, 400, 200], [100, 400, 200], scores=[0.9, 0.8, 0.7])
-    assert average_precision(tally([truth], [found])) == pytest.approx(0.5 + 0.5 * 2 / 3)
+    assert average_precision(tally([truth], [found])) == approx(0.5 + 0.5 * 2 / 3)
 
 
 def truth(u, v, depth_ratio=0.15, **more):
@@ -403,7 +399,7 @@ def test_two_detections_of_one_crater_are_one_right_and_one_false():
 def test_the_better_detection_takes_the_crater():
     tallied = tally([truth([100], [100])], [found([105, 100], [100, 100], [0.9, 0.8])])
     assert tallied.figures(0.85).detected_true == 1
-    assert tallied.error_u[tallied.outcome == 1] == pytest.approx([5.0])
+    assert tallied.error_u[tallied.outcome == 1] == approx([5.0])
 
 
 def test_precision_recall_and_f1_of_a_case_counted_by_hand():
@@ -411,17 +407,16 @@ def test_precision_recall_and_f1_of_a_case_counted_by_hand():
     figures = tally(
         [truth([50, 150, 250, 350], [50, 50, 50, 50])], [found([52, 150, 450], [50, 53, 450], [0.9, 0.8, 0.7])]
     ).figures(0.5)
-    assert figures.precision == pytest.approx(2 / 3)
-    assert figures.recall == pytest.approx(0.5)
-    assert figures.f1 == pytest.approx(4 / 7)
-    assert figures.loc_px == pytest.approx(2.5)
+    assert figures.precision == approx(2 / 3)
+    assert figures.recall == approx(0.5)
+    assert figures.f1 == approx(4 / 7)
+    assert figures.loc_px == approx(2.5)
 
 
 def test_the_pixel_rule_ends_at_ten_pixels_and_the_radius_rule_at_half_a_radius():
     frame = truth([100], [100])
     for u, right, rule in ((110, 1, {}), (110.1, 0, {}), (107.4, 1, {"radii": 0.5}), (107.6, 0, {"radii": 0.5})):
-        tallied = tally([frame], [found([u], [100], [0.9])], rule=MatchRule(**rule))
-        assert tallied.figures(0.5).detected_true == right
+        assert tally([frame], [found([u], [100], [0.9])], rule=MatchRule(**rule)).figures(0.5).detected_true == right
 
 
 def test_a_ghost_counts_when_strict_and_is_left_out_when_ignore_aware():
@@ -450,13 +445,12 @@ def test_a_detection_of_the_wrong_class_is_false_and_its_crater_missed():
 
 def test_nothing_expected_and_nothing_found_gives_no_figure_instead_of_a_perfect_one():
     figures = tally([truth([], [])], [found([], [], [])]).figures(0.5)
-    assert np.isnan([figures.precision, figures.recall, figures.f1, figures.loc_px]).all()
+    assert isnan([figures.precision, figures.recall, figures.f1, figures.loc_px]).all()
 
 
 def test_the_best_threshold_separates_right_from_wrong():
     frames = [truth([100, 200], [100, 200])] * 5
-    detections = [found([100, 200, 300], [100, 200, 300], [0.8, 0.7, 0.3])] * 5
-    threshold, figures = best_threshold(tally(frames, detections))
+    threshold, figures = best_threshold(tally(frames, [found([100, 200, 300], [100, 200, 300], [0.8, 0.7, 0.3])] * 5))
     assert 0.3 < threshold <= 0.7
     assert figures.f1 == 1.0
 
@@ -464,7 +458,7 @@ def test_the_best_threshold_separates_right_from_wrong():
 def test_the_bootstrap_interval_holds_the_figure_and_narrows_to_it_when_blocks_agree():
     frames = [truth([100, 200], [100, 200], number=k) for k in range(8)]
     detections = [found([100], [100], [0.9])] * 8
-    assert with_interval(tally(frames, detections), 0.5)["f1_interval_95"] == pytest.approx([2 / 3, 2 / 3])
+    assert with_interval(tally(frames, detections), 0.5)["f1_interval_95"] == approx([2 / 3, 2 / 3])
 
 
 points = st.lists(st.tuples(st.floats(0, 100), st.floats(0, 100)), max_size=12)
@@ -480,7 +474,7 @@ def test_a_match_is_one_to_one_and_within_reach(detections, craters):
     assert len(set(used.tolist())) == used.size
     for i, k in enumerate(taken):
         if k >= 0:
-            assert np.hypot(du[i] - cu[k], dv[i] - cv[k]) <= 10.0
+            assert hypot(du[i] - cu[k], dv[i] - cv[k]) <= 10.0
 
 
 def test_a_precision_that_rests_on_a_handful_of_detections_decides_nothing():
@@ -489,21 +483,20 @@ def test_a_precision_that_rests_on_a_handful_of_detections_decides_nothing():
     place = np.linspace(5.0, 505.0, 20)
     u, v = (part.ravel()[:n] for part in np.meshgrid(place, place))
     score = np.linspace(0.94, 0.30, n)
-    craters = truth(u[2:], v[2:], diameter=10.0)
-    tallied = tally([craters], [found(u, v, score)], rule=MatchRule(pixels=3.0))
+    tallied = tally([truth(u[2:], v[2:], diameter=10.0)], [found(u, v, score)], rule=MatchRule(pixels=3.0))
     assert tallied.figures(0.93).precision < 0.9
     assert threshold_for_precision(tallied, 0.9) < 0.31
 
 
 def scored_frames(count=150, seed=1):
     """Detections far from each other; right with the odds of exp(2 logit(score) + 1 - ln(diameter / 20))."""
-    rng = np.random.default_rng(seed)
+    rng = default_rng(seed)
     truths, found = [], []
     u, v = (part.ravel() for part in np.meshgrid(np.arange(40.0, 500.0, 60.0), np.arange(40.0, 500.0, 60.0)))
     for _ in range(count):
-        diameter = np.exp(rng.uniform(np.log(10.0), np.log(80.0), u.size))
+        diameter = exp(rng.uniform(log(10.0), log(80.0), u.size))
         score = np.sort(rng.uniform(0.1, 0.9, u.size))[::-1]
-        odds = np.exp(2.0 * np.log(score / (1.0 - score)) + 1.0 - np.log(diameter / 20.0))
+        odds = exp(2.0 * log(score / (1.0 - score)) + 1.0 - log(diameter / 20.0))
         right = rng.uniform(size=u.size) < odds / (1.0 + odds)
         found.append(found_at(u, v, diameter, 8e3, score))
         truths.append(truth_of(u[right], v[right], diameter[right], diameter_m=8e3))
@@ -512,27 +505,26 @@ def scored_frames(count=150, seed=1):
 
 def test_the_odds_put_in_are_the_odds_found():
     model = fit_score(*scored_frames())
-    assert model.slope == pytest.approx(2.0, rel=0.1)
-    offset = np.interp(np.log([14.0, 20.0, 40.0]), model.log_diameter_px, model.offset)
+    assert model.slope == approx(2.0, rel=0.1)
+    offset = np.interp(log([14.0, 20.0, 40.0]), model.log_diameter_px, model.offset)
     # Some 10,000 detections: the standard error of an offset is about 0.08.
-    assert offset == pytest.approx(1.0 - np.log(np.array([14.0, 20.0, 40.0]) / 20.0), abs=0.3)
-    half = model.probability(np.array([0.5]), np.array([20.0]))[0]
-    assert half == pytest.approx(np.e / (1.0 + np.e), abs=0.05)
+    assert offset == approx(1.0 - log(np.array([14.0, 20.0, 40.0]) / 20.0), abs=0.3)
+    assert model.probability(np.array([0.5]), np.array([20.0]))[0] == approx(np.e / (1.0 + np.e), abs=0.05)
 
 
 def test_too_few_detections_are_refused():
-    with pytest.raises(DatasetError, match="expected at least 200 detections"):
+    with raises(DatasetError, match="expected at least 200 detections"):
         fit_score(*scored_frames(2))
 
 
 def pairs(pull=(0.3, 0.2, 0.4), ground_m=((60.0, -30.0), (-20.0, 10.0)), lasting=1.2, fresh=0.4, seed=2):
     """Craters seen four times under one Sun, with a pull, a registration of two cells, and an error in two parts."""
-    rng = np.random.default_rng(seed)
+    rng = default_rng(seed)
     error, directions, scale, place, crater, size = [], [], [], [], [], []
     for number in range(3_000):
-        azimuth = rng.uniform(-np.pi, np.pi)
+        azimuth = rng.uniform(-pi, pi)
         sun = np.array([np.sin(azimuth), -np.cos(azimuth), -0.2])
-        diameter = float(np.exp(rng.uniform(np.log(10.0), np.log(60.0))))
+        diameter = float(exp(rng.uniform(log(10.0), log(60.0))))
         cell, m_per_px = number % 2, rng.uniform(100.0, 300.0)
         own = lasting * diameter / 20.0 * rng.standard_normal(2)
         toward = sun_directions(np.array([diameter]), sun)[0]
@@ -544,20 +536,20 @@ def pairs(pull=(0.3, 0.2, 0.4), ground_m=((60.0, -30.0), (-20.0, 10.0)), lasting
             scale.append(m_per_px)
             place.append(cell)
             crater.append(number)
-            size.append(np.log(diameter / 20.0))
+            size.append(log(diameter / 20.0))
     count = len(error)
     one = np.ones(count)
-    features = np.stack([one, np.array(size), np.log(1.5) * one, one, 1.7 * one, rng.uniform(0, 1.4, count)], axis=1)
+    features = np.stack([one, np.array(size), log(1.5) * one, one, 1.7 * one, rng.uniform(0, 1.4, count)], axis=1)
     return Pairs(np.array(error), features, np.array(directions), np.array(scale), np.array(place), np.array(crater))
 
 
 def test_pull_and_registration_are_separated():
     residual, evidence = fit_sun(pairs())
-    assert tuple(evidence["coefficients_px"]) == pytest.approx((0.3, 0.2, 0.4), abs=0.08)
+    assert tuple(evidence["coefficients_px"]) == approx((0.3, 0.2, 0.4), abs=0.08)
     assert max(evidence["standard_errors_px"]) < 0.05
     for row, (east, north) in zip(evidence["registration"], ((60.0, -30.0), (-20.0, 10.0)), strict=True):
-        assert row["east_m"] == pytest.approx(east, abs=8.0)
-        assert row["north_m"] == pytest.approx(north, abs=8.0)
+        assert row["east_m"] == approx(east, abs=8.0)
+        assert row["north_m"] == approx(north, abs=8.0)
         assert row["standard_error_m"] < 6.0
     assert np.abs(residual.mean(axis=0)).max() < 0.05
 
@@ -569,29 +561,28 @@ def test_lasting_and_fresh_errors_are_separated():
     residual, _ = fit_sun(every)
     model, evidence = fit_sigma(replace(every, error_px=residual))
     for size in (-0.5, 0.0, 0.8):
-        total, fresh = model.variances_px2(np.array([[1.0, size, np.log(1.5), 1.0, 1.7, 0.5]]))
-        lasting = 1.2 * np.exp(size)
-        assert np.sqrt(fresh[0]) == pytest.approx(FRESH_FACTOR * 0.4, rel=0.1)
-        assert np.sqrt(total[0]) == pytest.approx(np.hypot(0.4, lasting), rel=0.15)
-    assert evidence["mean_square_over_variance"] == pytest.approx(1.0, abs=0.05)
+        total, fresh = model.variances_px2(np.array([[1.0, size, log(1.5), 1.0, 1.7, 0.5]]))
+        lasting = 1.2 * exp(size)
+        assert sqrt(fresh[0]) == approx(FRESH_FACTOR * 0.4, rel=0.1)
+        assert sqrt(total[0]) == approx(hypot(0.4, lasting), rel=0.15)
+    assert evidence["mean_square_over_variance"] == approx(1.0, abs=0.05)
 
 
 def test_craters_seen_once_do_not_tell_what_lasts():
     every = pairs()
     once = every.select(np.arange(every.place.size) % 4 == 0)
-    with pytest.raises(DatasetError, match="several frames under one Sun"):
+    with raises(DatasetError, match="several frames under one Sun"):
         fit_sigma(once)
 
 
 def test_a_data_set_without_validation_frames_is_refused(make_blob_dataset, tmp_path):
     only_test = make_blob_dataset(tmp_path / "set", {"test": 1})
-    with pytest.raises(DatasetError, match="expected frames of split 'val'"):
+    with raises(DatasetError, match="expected frames of split 'val'"):
         fit_calibration(load_shipped_model(), [only_test])
 
 
 def test_a_calibrated_model_gives_back_the_plain_one():
-    octets = load_shipped_model()
-    plain = plain_model(octets)
+    plain = plain_model(load_shipped_model())
     metadata = OnnxDetector(plain).metadata
     assert CALIBRATION_KEY not in metadata and metadata["score_threshold"] == "0.44"
     assert plain_model(plain) == plain

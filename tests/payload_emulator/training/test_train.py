@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from pytest import raises
 
 from lunar.constants import MOON_RADIUS_M
 from payload_emulator.errors import DatasetError, ModelError
@@ -69,8 +70,7 @@ def test_the_best_validation_is_kept(blob_dataset, tmp_path, monkeypatch):
         "_validate",
         lambda *_: {"f1": next(values), "precision": 0.0, "recall": 0.0, "loc_px": 1.0, "threshold": 0.4},
     )
-    parameters = replace(SHORT, steps=3, validate_every_minutes=0.0)
-    figures = train([blob_dataset], tmp_path, parameters)
+    figures = train([blob_dataset], tmp_path, replace(SHORT, steps=3, validate_every_minutes=0.0))
     assert figures["steps"] == 3 and figures["best"] == {"f1": 0.5, "step": 1}
 
 
@@ -96,8 +96,7 @@ def test_a_network_retrained_with_learned_craters_finds_them_elsewhere_and_no_fe
     train([listed], tmp_path / "old", parameters := replace(SHORT, steps=40))
     recall = []
     for name, learned in (("further", None), ("learned", pits_at(here, listed))):
-        start = tmp_path / "old" / "checkpoint.pt"
-        train([listed], tmp_path / name, parameters, start_from=start, landmarks=learned)
+        train([listed], tmp_path / name, parameters, start_from=tmp_path / "old" / "checkpoint.pt", landmarks=learned)
         network, _ = load_network(tmp_path / name / "checkpoint.pt")
         found = [detect_with_network(network, unseen, one, "cpu") for one in frames]
         recall.append([tally(truth, found).figures(0.1).recall for truth in truths])
@@ -119,10 +118,10 @@ def test_the_weight_of_small_craters_is_bounded_below(blob_dataset, monkeypatch)
     assert least(0.05) < least(0.9) < least(1.0) <= 1.0
 
 
-@pytest.mark.parametrize(("splits", "lacking"), [({"test": 1}, "train"), ({"train": 1}, "val")])
+@pytest.mark.parametrize("splits, lacking", [({"test": 1}, "train"), ({"train": 1}, "val")])
 def test_a_data_set_without_training_or_validation_frames_is_refused(make_blob_dataset, tmp_path, splits, lacking):
     empty = make_blob_dataset(tmp_path / "set", splits)
-    with pytest.raises(DatasetError, match=f"split '{lacking}', found none"):
+    with raises(DatasetError, match=f"split '{lacking}', found none"):
         train([empty], tmp_path / "run", SHORT)
     assert not (tmp_path / "run").exists()
 
@@ -130,7 +129,7 @@ def test_a_data_set_without_training_or_validation_frames_is_refused(make_blob_d
 def test_data_sets_of_two_cameras_are_refused(blob_dataset, make_blob_dataset, tmp_path):
     other = make_blob_dataset(tmp_path / "set", {"train": 1, "val": 1})
     other.index["camera"]["fov_deg"] = 90.0
-    with pytest.raises(DatasetError, match="data sets of one camera, found several"):
+    with raises(DatasetError, match="data sets of one camera, found several"):
         train([blob_dataset, other], tmp_path / "run", SHORT)
 
 
@@ -148,9 +147,9 @@ def test_a_damaged_checkpoint_is_refused_and_a_hostile_one_runs_nothing(blob_dat
     hostile = {"config": _Hostile(tmp_path / "mark")}
     for other in (b"damaged", {}, parts, parts | {"config": {"none": 1}}, hostile):
         path.write_bytes(other) if other == b"damaged" else torch.save(other, path)
-        with pytest.raises(ModelError, match="expected a checkpoint"):
+        with raises(ModelError, match="expected a checkpoint"):
             load_network(path)
-    with pytest.raises(ModelError, match="expected a checkpoint"):
+    with raises(ModelError, match="expected a checkpoint"):
         train([blob_dataset], tmp_path, SHORT)
     assert not (tmp_path / "mark").exists()
 

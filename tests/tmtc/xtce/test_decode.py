@@ -3,10 +3,12 @@
 import math
 import struct
 import warnings
+from math import nan
 
 import numpy as np
-import pytest
 import space_packet_parser as spp
+from numpy.random import default_rng
+from pytest import approx, mark, raises
 
 from tests.tmtc import foreign
 from tests.tmtc.foreign import (
@@ -85,7 +87,7 @@ def same(a, b):
     return a == b or (isinstance(a, float) and isinstance(b, float) and math.isnan(a) and math.isnan(b))
 
 
-@pytest.mark.parametrize("seed", range(3))
+@mark.parametrize("seed", range(3))
 def test_an_independent_interpreter_reads_the_same_values_of_another_mission(seed, tmp_path):
     path = tmp_path / "bus.xml"
     path.write_text(foreign.BUS, encoding="utf-8")
@@ -107,9 +109,9 @@ def test_an_independent_interpreter_reads_the_same_values_of_another_mission(see
 # integers and floats of any width at any place
 
 
-@pytest.mark.parametrize("bits", range(1, 65))
+@mark.parametrize("bits", range(1, 65))
 def test_integers_of_every_width_stand_at_every_place(bits):
-    rng = np.random.default_rng(bits)
+    rng = default_rng(bits)
     types = integer("U", bits) + integer("I", bits, "twosComplement") + integer("PAD", 1)
     for phase in range(8):
         text = layout(types, **{f"P{k}": "PAD" for k in range(phase)}, A="U", B="I")
@@ -129,8 +131,7 @@ def test_other_signs_are_read():
     for value in (-255, -1, 0, 1, 255):
         ones = value if value >= 0 else ~-value & 0x1FF
         sign = value if value >= 0 else 0x100 | -value
-        found = one(Bits().add(ones, 9).add(sign, 9).packed(), types, A="ONES", B="SIGN")
-        assert found == {"A": [value], "B": [value]}
+        assert one(Bits().add(ones, 9).add(sign, 9).packed(), types, A="ONES", B="SIGN") == {"A": [value], "B": [value]}
 
 
 # The examples of MIL-STD-1750A for 32 and 48 bits, and the least positive step of 48 bits at exponent 0 by hand
@@ -143,7 +144,7 @@ MIL_STD_1750A = """
 """
 
 
-@pytest.mark.parametrize("row", MIL_STD_1750A.split(","))
+@mark.parametrize("row", MIL_STD_1750A.split(","))
 def test_floats_of_mil_std_1750a_are_those_of_the_standard(row):
     octets, mantissa, exponent = row.split()
     data = bytes.fromhex(octets)
@@ -151,8 +152,8 @@ def test_floats_of_mil_std_1750a_are_those_of_the_standard(row):
     assert found["A"] == [float(mantissa) * 2.0 ** int(exponent)]
 
 
-@pytest.mark.parametrize("bits", [16, 32, 64])
-@pytest.mark.parametrize("phase", [0, 3])
+@mark.parametrize("bits", [16, 32, 64])
+@mark.parametrize("phase", [0, 3])
 def test_ieee_floats_stand_at_every_place(bits, phase):
     code = {16: "e", 32: "f", 64: "d"}[bits]
     types = floating("F", bits) + floating("L", bits, order=foreign.LITTLE) + integer("PAD", 3)
@@ -174,22 +175,20 @@ def test_a_value_outside_its_spline_is_unknown_and_keeps_its_raw_value_unless_ex
     def read(types):
         return values(layout(types, A="T"), packets)["A"]
 
-    assert read(steps) == pytest.approx([math.nan, 1.0, 1.0, 3.0, 3.0, 5.0, math.nan], nan_ok=True)
-    assert read(lines) == pytest.approx([math.nan, 1.0, 2.8, 3.0, 3.5, 5.0, math.nan], nan_ok=True)
-    assert read(on) == pytest.approx([0.8, 1.0, 2.8, 3.0, 3.5, 5.0, 5.1], rel=1e-15)
+    assert read(steps) == approx([nan, 1.0, 1.0, 3.0, 3.0, 5.0, nan], nan_ok=True)
+    assert read(lines) == approx([nan, 1.0, 2.8, 3.0, 3.5, 5.0, nan], nan_ok=True)
+    assert read(on) == approx([0.8, 1.0, 2.8, 3.0, 3.5, 5.0, 5.1], rel=1e-15)
     found = decoded(layout(lines, A="T"), packets)
     assert found.counts()["decoded"] == 7 and found.values_unknown() == {"A": 2}
     assert found.tables["P"].columns["A"].to_list(raw=True) == [9, 10, 19, 20, 25, 40, 41]
-    differs = child(comparison("A", 1.0, "!="))
-    text = layout(lines, differs, A="T")
+    text = layout(lines, child(comparison("A", 1.0, "!=")), A="T")
     assert decoded(text, packets).tables["Q"].packet_index.tolist() == [2, 3, 4, 5]  # nothing is known of the others
 
 
 def test_splines_of_yamcs_are_extrapolated_and_its_sizes_before_texts_count_octets():
     spline = foreign.spline([(0, 0), (100, 10)], 1, False).replace(' extrapolate="false"', "")
     tagged = fixed_size(72, '<LeadingSize sizeInBitsOfSizeTag="8"/>')
-    types = calibrated("T", 8, "unsigned", default(spline)) + text_type(tagged, name="S")
-    text = layout(types, A="T", B="S")
+    text = layout(calibrated("T", 8, "unsigned", default(spline)) + text_type(tagged, name="S"), A="T", B="S")
     packet = bytes((200, 8)) + b"ABCDEFGH"
     others = decoded(text, [packet])
     assert values(text, [packet])["B"] == ["A"] and others.values_unknown() == {"A": 1}
@@ -233,8 +232,7 @@ def test_a_text_may_say_its_length_itself():
     ]
     assert verdicts(text, wrong) == ["decoded", "too_short", "decoded", "too_short"]
     assert values(text, wrong) == {"A": [None, None], "B": [7, 7]}
-    column = decoded(text, wrong).tables["P"].columns["A"]
-    assert column.to_list(raw=True)[1] == b"\0\2\xc3\x28"
+    assert decoded(text, wrong).tables["P"].columns["A"].to_list(raw=True)[1] == b"\0\2\xc3\x28"
     bits = Decoder(parse_xtce(text, "bits")).decode(*whole([struct.pack(">H", 12) + b"yyyy"]))
     assert bits.tables["P"].columns["A"].to_list() == [None]  # no whole octets
 
@@ -250,16 +248,14 @@ def test_octets_may_say_their_length_themselves_as_yamcs_writes_it():
 def test_a_text_may_end_with_a_character_and_what_follows_begins_there():
     types = variable(10, "<TerminationChar>00</TerminationChar>") + integer("N", 8)
     text = layout(types, A="T", B="N")
-    found = values(text, [b"\0\x05", b"ab\0\x06", b"abcdefghi\0\x07"])
-    assert found == {"A": ["", "ab", "abcdefghi"], "B": [5, 6, 7]}
+    assert values(text, [b"\0\x05", b"ab\0\x06", b"abcdefghi\0\x07"]) == {"A": ["", "ab", "abcdefghi"], "B": [5, 6, 7]}
     assert verdicts(text, [b"abc", b"abcdefghijk\0\x07"]) == ["too_short", "malformed"]
     last = layout(types, A="T")
     assert values(last, [b"abc"])["A"] == ["abc"]  # the text fills what is left
 
 
 def test_a_text_without_terminator_fills_its_field_and_one_of_two_octets_stands_at_a_character():
-    types = text_type(fixed_size(24, "<TerminationChar/>")) + integer("N", 8)
-    text = layout(types, A="T", B="N")
+    text = layout(text_type(fixed_size(24, "<TerminationChar/>")) + integer("N", 8), A="T", B="N")
     packets = [b"ab\0\x07", b"abc\x07", b"\xc3\x28\0\x07"]
     assert values(text, packets) == {"A": ["ab", "abc", None], "B": [7] * 3}
     assert decoded(text, packets).values_unknown() == {"A": 1}
@@ -268,15 +264,14 @@ def test_a_text_without_terminator_fills_its_field_and_one_of_two_octets_stands_
     assert one(data, text_type(size, "UTF-16BE"), A="T")["A"] == ["aĀ"]
 
 
-@pytest.mark.parametrize("charset", ["US-ASCII", "UTF-8", "ISO-8859-1", "UTF-16BE", "UTF-16LE"])
+@mark.parametrize("charset", ["US-ASCII", "UTF-8", "ISO-8859-1", "UTF-16BE", "UTF-16LE"])
 def test_zeros_at_the_end_of_a_text_belong_to_it(charset):
     text = layout(text_type(fixed_size(64), charset), A="T")
     expected = ["ab\0\0", "\0\0\0\0", "a\0b\0", "abcd"] * (2 if charset.startswith("UTF-16") else 1)
     if not charset.startswith("UTF-16"):
         expected = [one * 2 for one in expected]
     expected += [one.replace("\0", "z") for one in expected] * 3
-    packets = [one.encode(charset) for one in expected]
-    assert values(text, packets)["A"] == expected
+    assert values(text, [one.encode(charset) for one in expected])["A"] == expected
 
 
 def test_texts_that_begin_inside_an_octet_are_read_and_a_size_may_be_looked_up():
@@ -339,9 +334,8 @@ def test_arrays_of_aggregates_follow_their_count_as_in_the_pus_examples_of_yamcs
 
 
 def test_elements_of_odd_width_begin_anywhere():
-    types = integer("N", 5) + integer("E", 11) + array_type("A", "E", dimension("n"))
-    text = layout(types, n="N", a="A", z="N")
-    rng = np.random.default_rng(3)
+    text = layout(integer("N", 5) + integer("E", 11) + array_type("A", "E", dimension("n")), n="N", a="A", z="N")
+    rng = default_rng(3)
     rows = [rng.integers(0, 2048, n).tolist() for n in (0, 1, 2, 7, 31)]
     packets = []
     for row in rows:
@@ -355,8 +349,7 @@ def test_elements_of_odd_width_begin_anywhere():
 
 def test_arrays_of_two_dimensions_are_lists_of_lists_the_last_index_moving_fastest():
     types = integer("N", 8) + array_type("A", "N", dimension("n") + dimension(last=4, first=3))
-    found = one(bytes((3, 1, 2, 3, 4, 5, 6)), types, n="N", a="A")
-    assert found["a"] == [[[1, 2], [3, 4], [5, 6]]]
+    assert one(bytes((3, 1, 2, 3, 4, 5, 6)), types, n="N", a="A")["a"] == [[[1, 2], [3, 4], [5, 6]]]
 
 
 def test_elements_that_say_their_own_length_are_read_one_after_another():
@@ -449,7 +442,7 @@ def test_an_entry_may_stand_at_a_place_that_the_packet_states():
     assert values(text, packets) == {"n": [1, 2], "a": [2, 4], "b": [4, 7]}
 
 
-@pytest.mark.parametrize("kind", [integer("A", 8), text_type(fixed_size(8), name="A")])
+@mark.parametrize("kind", [integer("A", 8), text_type(fixed_size(8), name="A")])
 def test_repetitions_stand_apart_by_their_offset(kind):
     repeat = (
         f'<ParameterRefEntry parameterRef="a"><RepeatEntry><Count>{dynamic("n")}</Count>'
@@ -491,8 +484,7 @@ def test_names_in_nested_systems_are_found_by_path_and_distinguished():
 def test_definitions_may_be_spread_over_documents():
     types = document(integer("u8", 8), {}, "", name="dt")
     packets = document("", {"x": "/dt/u8"}, container("P", ["x"]), name="PUS")
-    definition = parse_xtce({"dt.xml": types, "pus.xml": packets})
-    found = Decoder(definition).decode(*whole([b"\x2a"]))
+    found = Decoder(parse_xtce({"dt.xml": types, "pus.xml": packets})).decode(*whole([b"\x2a"]))
     assert found.tables["P"].columns["x"].to_list() == [42]
 
 
@@ -523,15 +515,13 @@ def test_a_packet_is_decoded_by_one_container_or_refused_with_the_reason():
 def test_damaged_packets_are_left_out():
     octets, cut = whole([b"\x01", b"\x02"])
     damaged = PacketCut(cut.offsets, cut.lengths, np.array([True, False]), cut.skipped, cut.idle, cut.consumed)
-    definition = parse_xtce(layout(integer("N", 8), a="N"))
-    found = Decoder(definition).decode(octets, damaged)
+    found = Decoder(parse_xtce(layout(integer("N", 8), a="N"))).decode(octets, damaged)
     assert found.tables["P"].columns["a"].to_list() == [1] and found.verdict.tolist() == [0, 5]
 
 
-@pytest.mark.parametrize("count", [0, 1, 2, 255])
+@mark.parametrize("count", [0, 1, 2, 255])
 def test_an_array_cut_off_is_too_short_and_a_negative_count_malformed(count):
-    types = integer("N", 8) + integer("E", 32) + array_type("A", "E", dimension("n", intercept=-3))
-    text = layout(types, n="N", a="A")
+    text = layout(integer("N", 8) + integer("E", 32) + array_type("A", "E", dimension("n", intercept=-3)), n="N", a="A")
     full = bytes((count,)) + bytes(4 * max(count - 2, 0))
     expected = "malformed" if count < 2 else "decoded"
     assert verdicts(text, [full]) == [expected]
@@ -539,25 +529,21 @@ def test_an_array_cut_off_is_too_short_and_a_negative_count_malformed(count):
         assert verdicts(text, [full[:-1]]) == ["too_short"]
 
 
-@pytest.mark.parametrize(
-    "slope, verdict", [(-8, "malformed"), (0.5, "malformed"), (1e300, "too_short"), (8, "decoded")]
-)
+@mark.parametrize("slope, verdict", [(-8, "malformed"), (0.5, "malformed"), (1e300, "too_short"), (8, "decoded")])
 def test_sizes_that_are_none_condemn_the_packet_alone(slope, verdict):
     text = layout(integer("N", 64) + binary(dynamic("n", slope=slope)), n="N", b="B")
-    packets = [struct.pack(">Q", 3) + b"abc", struct.pack(">Q", 2**64 - 1) + b"abc"]
-    found = verdicts(text, packets)
+    found = verdicts(text, [struct.pack(">Q", 3) + b"abc", struct.pack(">Q", 2**64 - 1) + b"abc"])
     assert found[0] == verdict and found[1] != "decoded"
 
 
 def test_an_element_that_its_calibrator_does_not_cover_is_unknown_alone():
     element = calibrated("E", 8, "unsigned", default(foreign.spline([(0, 0), (100, 50)], 1, False)))
-    types = integer("N", 8) + element + array_type("A", "E", dimension("n"))
-    text = layout(types, n="N", a="A", z="N")
+    text = layout(integer("N", 8) + element + array_type("A", "E", dimension("n")), n="N", a="A", z="N")
     packets = [bytes((2, 10, 20, 1)), bytes((3, 30, 101, 40, 2)), bytes((1, 100, 3)), bytes((0, 4))]
     assert verdicts(text, packets) == ["decoded"] * 4
     found = values(text, packets)
     assert found["z"] == [1, 2, 3, 4] and found["a"][0::2] == [[5.0, 10.0], [50.0]]
-    assert found["a"][1] == pytest.approx([15.0, math.nan, 20.0], nan_ok=True)
+    assert found["a"][1] == approx([15.0, nan, 20.0], nan_ok=True)
     assert decoded(text, packets).values_unknown() == {"a": 1}
 
 
@@ -571,13 +557,12 @@ def test_every_truncation_of_every_packet_is_a_verdict():
 
 
 def test_noise_is_decoded_or_given_a_verdict_and_never_stops_the_others():
-    rng = np.random.default_rng(4)
+    rng = default_rng(4)
     definition = parse_xtce(foreign.BUS)
     good = foreign.capture(50, 6)
     noise = [space_packet(int(rng.integers(100, 103)), rng.bytes(int(rng.integers(1, 200))), 0) for _ in range(500)]
     mixed = [p for pair in zip(good, noise[:50], strict=True) for p in pair] + noise[50:]
-    found = Decoder(definition).decode(*whole(mixed))
-    assert found.verdict[0:100:2].tolist() == [0] * 50
+    assert Decoder(definition).decode(*whole(mixed)).verdict[0:100:2].tolist() == [0] * 50
 
 
 def test_chunks_of_packets_are_joined(monkeypatch):
@@ -610,9 +595,9 @@ def test_first_containers_are_distinguished_by_their_conditions():
 
 def test_the_first_of_several_containers_is_named_and_columns_of_numbers_are_arrays():
     text = layout(integer("N", 8), container("Q", ["a"]), a="N")
-    with pytest.raises(DefinitionError, match=r"BUS: expected one container without a base, found 2 \(P, Q\)"):
+    with raises(DefinitionError, match=r"BUS: expected one container without a base, found 2 \(P, Q\)"):
         decoded(text, [b"\x01"])
-    with pytest.raises(DefinitionError, match="expected the name of a container"):
+    with raises(DefinitionError, match="expected the name of a container"):
         decoded(text, [b"\x01"], "R")
     assert list(decoded(text, [b"\x01"], "Q").tables) == ["Q"]
     column = decoded(foreign.BUS, foreign.capture(30, 1)).tables["Housekeeping"].columns["VOLTAGE"]

@@ -3,10 +3,12 @@
 import math
 import warnings
 import xml.etree.ElementTree as ET
+from math import isnan
 
 import numpy as np
-import pytest
 import space_packet_parser as spp
+from numpy.random import default_rng
+from pytest import fixture, mark
 from space_packet_parser.xtce.validation import validate_xtce
 
 from tmtc.dictionary.fields import PARAMETERS, Field
@@ -18,7 +20,7 @@ from tmtc.xtce.export import format_xtce, parameter_name
 from tmtc.xtce.importing import parse_xtce
 
 
-@pytest.fixture(scope="module")
+@fixture(scope="module")
 def document(tmp_path_factory):
     """The unrolled form: the independent decoder does not support arrays."""
     path = tmp_path_factory.mktemp("xtce") / "linna.xml"
@@ -26,7 +28,7 @@ def document(tmp_path_factory):
     return path
 
 
-@pytest.fixture(scope="module")
+@fixture(scope="module")
 def decoder(document):
     return spp.load_xtce(document)
 
@@ -49,14 +51,14 @@ def test_the_form_with_arrays_validates_against_the_schema_and_is_short(tmp_path
     assert len(text) < 300_000
 
 
-@pytest.fixture(scope="module")
+@fixture(scope="module")
 def imported():
     return parse_xtce(format_xtce())
 
 
-@pytest.mark.parametrize("definition", DICTIONARY.telemetry, ids=lambda d: d.name)
+@mark.parametrize("definition", DICTIONARY.telemetry, ids=lambda d: d.name)
 def test_the_form_with_arrays_is_imported_to_equal_values_of_every_packet(definition, imported):
-    rng = np.random.default_rng(18)
+    rng = default_rng(18)
     counts = [0, 1, 2, 40, 255] if definition.group else [0, 0, 0]
     packets = [random_packet(definition, count, rng) for count in counts]
     cut = whole_packets(np.array([len(packet) for packet in packets]))
@@ -103,8 +105,8 @@ def assert_imported(pair, value, raw, f):
         assert pair == (f.label(raw), raw)
     elif f.missing is not None and raw == f.missing:
         assert pair[1] == raw
-    elif f.is_float and math.isnan(value):
-        assert math.isnan(pair[0])
+    elif f.is_float and isnan(value):
+        assert isnan(pair[0])
     else:
         assert pair == (value, raw)
 
@@ -137,9 +139,9 @@ def random_packet(definition, count, rng):
     )  # fmt: skip
 
 
-@pytest.mark.parametrize("definition", DICTIONARY.telemetry, ids=lambda d: d.name)
+@mark.parametrize("definition", DICTIONARY.telemetry, ids=lambda d: d.name)
 def test_an_independent_decoder_reads_every_packet_to_equal_values(definition, decoder):
-    rng = np.random.default_rng(17)
+    rng = default_rng(17)
     counts = [0, 1, 2, 40] if definition.group else [0, 0, 0]
     if definition.name == "detections":
         counts.append(255)  # the longest; this decoder needs a second for it
@@ -168,8 +170,8 @@ def test_an_independent_decoder_reads_every_packet_to_equal_values(definition, d
 def assert_equal(theirs, value, raw, f):
     if f.labels:
         assert (str(theirs), theirs.raw_value) == (f.label(raw), raw)
-    elif f.is_float and math.isnan(value):
-        assert math.isnan(theirs)
+    elif f.is_float and isnan(value):
+        assert isnan(theirs)
     else:
         assert theirs == value and theirs.raw_value == raw
 

@@ -2,7 +2,7 @@
 
 import struct
 
-import pytest
+from pytest import mark, raises
 
 from tests.tmtc import foreign
 from tests.tmtc.foreign import (
@@ -38,7 +38,7 @@ def plain(*more):
 
 
 def refused(text):
-    with pytest.raises(DefinitionError) as caught:
+    with raises(DefinitionError) as caught:
         parse_xtce({"bus.xml": text})
     message = str(caught.value)
     assert "\n" not in message and message.startswith("bus.xml")
@@ -58,7 +58,7 @@ def chosen(text, *packets):
 # the document
 
 
-@pytest.mark.parametrize("share", [0.0, 0.1, 0.5, 0.9, 0.999])
+@mark.parametrize("share", [0.0, 0.1, 0.5, 0.9, 0.999])
 def test_a_document_cut_off_is_refused(share):
     octets = foreign.BUS.encode()
     assert "well-formed XML" in refused(octets[: int(len(octets) * share)])
@@ -96,7 +96,7 @@ OTHERS = """
 """
 
 
-@pytest.mark.parametrize("row", OTHERS.strip("\n").splitlines())
+@mark.parametrize("row", OTHERS.strip("\n").splitlines())
 def test_other_documents_are_refused(row):
     text, words = row.split(" | ")
     assert words in refused(text.encode())
@@ -109,7 +109,7 @@ def test_octets_of_other_encodings_are_read():
 # references
 
 
-@pytest.mark.parametrize(
+@mark.parametrize(
     "text, words",
     [
         (layout(U8, a="u9"), "Parameter 'a': expected the name of a parameter type, found 'u9'"),
@@ -136,7 +136,7 @@ def test_a_size_that_stands_behind_what_it_measures_is_refused():
 INSIDE = '<ContainerRefEntry containerRef="{}"/>'.format
 
 
-@pytest.mark.parametrize(
+@mark.parametrize(
     "text, words",
     [
         (document(U8, {"a": "u8"}, container("P", ["a"], "P")), "found itself"),
@@ -235,7 +235,7 @@ array | * | <ArrayParameterType name="t" arrayTypeRef="u8"><DimensionList/></Arr
 """
 
 
-@pytest.mark.parametrize("row", FAULTS.strip().splitlines())
+@mark.parametrize("row", FAULTS.strip().splitlines())
 def test_types_beyond_the_subset_or_their_bounds_are_refused_by_name(row):
     kind, old, new, words = row.split(" | ")
     assert old == "*" or old in TYPES[kind]
@@ -257,7 +257,7 @@ is supported (ParameterRefEntry, ArrayParameterRefEntry, ContainerRefEntry), fou
 """
 
 
-@pytest.mark.parametrize("row", ENTRIES.strip().splitlines())
+@mark.parametrize("row", ENTRIES.strip().splitlines())
 def test_entries_beyond_the_subset_are_refused_by_name(row):
     entry, words = row.split(" | ")
     assert words in refused(document(U8, {"a": "u8"}, container("P", [entry])))
@@ -279,7 +279,7 @@ CRITERIA = f"""
 """
 
 
-@pytest.mark.parametrize("row", CRITERIA.strip().splitlines())
+@mark.parametrize("row", CRITERIA.strip().splitlines())
 def test_conditions_beyond_the_subset_are_refused_by_name(row):
     criteria, words = row.split(" | ")
     assert words in refused(layout(U8 + MODES, child(criteria), a="u8", b="m"))
@@ -296,8 +296,7 @@ def test_conditions_are_joined_and_compared_as_written():
 
     inner = f"<ORedConditions>{condition('a', '<', 'b')}{condition('b', '==', '0')}</ORedConditions>"
     joined = f"<ANDedConditions>{condition('a', '!=', '5')}{inner}</ANDedConditions>"
-    expression = f"<BooleanExpression>{joined}</BooleanExpression>"
-    text = layout(U8, child(expression), a="u8", b="u8")
+    text = layout(U8, child(f"<BooleanExpression>{joined}</BooleanExpression>"), a="u8", b="u8")
     pairs = [(a, b) for a in range(8) for b in range(8)]
     found = decoded(text, [bytes(pair) for pair in pairs])
     expected = [k for k, (a, b) in enumerate(pairs) if a != 5 and (a < b or b == 0)]
@@ -308,24 +307,22 @@ def test_conditions_are_joined_and_compared_as_written():
 OPERATORS = {"==": "3", "!=": "124", "<": "12", "<=": "123", ">": "4", ">=": "34", "geq": "34"}
 
 
-@pytest.mark.parametrize("operator", OPERATORS)
-@pytest.mark.parametrize("width, value, types", [
+@mark.parametrize("operator", OPERATORS)
+@mark.parametrize("width, value, types", [
     (1, 3, integer("t", 8)), (8, 3, integer("t", 64)),
     (1, 1.5, calibrated("t", 8, "unsigned", default(polynomial(0.0, 0.5)))),
 ])  # fmt: skip
 def test_comparisons_mean_what_they_say(operator, width, value, types):
     text = layout(types, child(comparison("a", value, operator)), a="t")
-    found = chosen(text, *(k.to_bytes(width, "big") for k in range(1, 5)))
-    assert found == [int(k) - 1 for k in OPERATORS[operator]]
+    assert chosen(text, *(k.to_bytes(width, "big") for k in range(1, 5))) == [int(k) - 1 for k in OPERATORS[operator]]
 
 
 def test_names_of_codes_are_compared():
     for operator, expected in (("==", [1]), ("!=", [0, 2])):
-        text = layout(MODES, child(comparison("a", "ON", operator)), a="m")
-        assert chosen(text, b"\0", b"\1", b"\2") == expected
+        assert chosen(layout(MODES, child(comparison("a", "ON", operator)), a="m"), b"\0", b"\1", b"\2") == expected
 
 
-@pytest.mark.parametrize("spelling", ["IEEE-754", "IEEE754", "IEEE754_1985"])
+@mark.parametrize("spelling", ["IEEE-754", "IEEE754", "IEEE754_1985"])
 def test_floats_are_known_by_their_older_names(spelling):
     assert values(layout(floating("f", 32, spelling), a="f"), [b"\x3f\xc0\0\0"]) == {"a": [1.5]}
 
@@ -410,8 +407,7 @@ def test_entries_are_repeated_as_arrays():
 def test_integers_may_be_stored_as_floats_octet_orders_listed_and_commands_refuse_nothing():
     types = floating("t", 32).replace("FloatParameterType", "IntegerParameterType")
     types += floating("f", 32).replace("FloatParameterType", "BooleanParameterType")
-    text = layout(types, a="t", b="f")
-    assert values(text, [struct.pack(">ff", 42.0, 1.0)]) == {"a": [42.0], "b": [True]}
+    assert values(layout(types, a="t", b="f"), [struct.pack(">ff", 42.0, 1.0)]) == {"a": [42.0], "b": [True]}
     for order, value in (("3,2,1,0", 0x01020304), ("0,1,2,3", 0x04030201)):
         assert values(of_type(integer("t", 32, order=order)), [b"\1\2\3\4"]) == {"a": [value]}
     assert "byteOrder" in refused(of_type(integer("t", 32, order="2,3,0,1")))
@@ -452,8 +448,7 @@ def test_descriptions_alarms_algorithms_and_commands_change_nothing():
     )
     text = document(types, {"a": "t"}, PLAIN, more="<CommandMetaData><MetaCommandSet/></CommandMetaData>")
     text = text.replace("</ContainerSet>", "</ContainerSet><AlgorithmSet><CustomAlgorithm name='x'/></AlgorithmSet>")
-    definition = parse_xtce(text)
-    (parameter,) = definition.parameters.values()
+    (parameter,) = parse_xtce(text).parameters.values()
     assert isinstance(parameter.type, ScalarType) and parameter.type.unit == "m"
     assert isinstance(parameter.type.encoding, IntegerEncoding)
     assert parameter.type.encoding.calibration.default == Polynomial(((1.0, 0), (2.0, 1)))

@@ -276,6 +276,11 @@ def test_a_file_that_is_none_is_refused_in_one_line(tmp_path, text, message):
         read_receptions(tmp_path / "t.csv")
 
 
+def test_an_archive_may_have_no_receptions(tmp_path):
+    (tmp_path / "t.csv").write_text("packet_ticks,sequence_count,received_utc\n")
+    assert read_receptions(tmp_path / "t.csv", 0) == []
+
+
 @mark.parametrize(
     "changes, kinds",
     [
