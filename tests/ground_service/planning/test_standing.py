@@ -409,7 +409,7 @@ def test_a_draft_whose_time_has_come_ends(either, now):
     assert (ended.state, ended.reason) == ("failed", standing.NOT_APPROVED)
 
 
-def test_nothing_to_send_is_status_2_and_no_file(ground, tmp_path, capsys):
+def test_nothing_to_send_is_status_2_and_no_file(ground, tmp_path, capsys, now):
     window = on_board(ground)
     out = tmp_path / "w.cltu"
     assert run(["plan", "uplink", str(window.id), "--home", str(ground.home), "--out", str(out)]) == 2
