@@ -60,7 +60,7 @@ def test_the_hash_of_a_network_does_not_depend_on_its_metadata_which_are_loaded_
 
 
 OTHERS = """{"version": 2} | expected version 1, found 2
-{"network_sha256": "00"} | expected a calibration of this network
+{"network_sha256": "0000000000000000000000000000000000000000000000000000000000000000"} | a calibration of this network
 {"sun": {}, "score": {}} | expected standard deviations alone, found score, sun
 {"sigma": {"fresh": [1.0, 2.0]}} | 6 finite numbers expected, 2 values found
 {"sigma": {"fresh": [NaN, NaN, NaN, NaN, NaN, NaN]}} | 6 finite numbers expected
