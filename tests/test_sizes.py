@@ -51,17 +51,19 @@ def test_a_package_that_the_table_does_not_know_is_above_its_limit():
     assert len(sizes.above({"new": (1, 1)}, {"p": (10, 100)})) == 2
 
 
-@mark.parametrize(
-    "after, refused",
-    [
-        ({"a": (9, 9), "b": (10, 10)}, 0),
-        ({"a": (11, 10), "b": (10, 10)}, 1),
-        ({"a": (11, 10), "b": (9, 10)}, 1),  # as much as it rises is not more
-        ({"a": (11, 10), "b": (8, 10)}, 0),
-        ({"a": (11, 11), "b": (8, 10)}, 1),
-        ({"b": (10, 10), "c": (9, 9)}, 0),  # renamed and smaller
-        ({"b": (10, 10), "c": (10, 9)}, 1),
-    ],
-)
-def test_a_limit_rises_only_if_another_falls_by_more(after, refused):
-    assert len(sizes.unpaid({"a": (10, 10), "b": (10, 10)}, after)) == refused
+# as much as it rises is not more; renamed and smaller is
+CHANGES = """a 9 9 b 10 10: 0
+a 11 10 b 10 10: 1
+a 11 10 b 9 10: 1
+a 11 10 b 8 10: 0
+a 11 11 b 8 10: 1
+b 10 10 c 9 9: 0
+b 10 10 c 10 9: 1"""
+
+
+@mark.parametrize("row", CHANGES.splitlines())
+def test_a_limit_rises_only_if_another_falls_by_more(row):
+    sized, refused = row.split(":")
+    one, lines, tokens, other, more_lines, more_tokens = sized.split()
+    after = {one: (int(lines), int(tokens)), other: (int(more_lines), int(more_tokens))}
+    assert len(sizes.unpaid({"a": (10, 10), "b": (10, 10)}, after)) == int(refused)

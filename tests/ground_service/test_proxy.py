@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import httpx
-import pytest
+from pytest import fixture, mark, raises, skip, warns
 from websockets.sync.client import connect
 
 from ground_service.access.service import add_user
@@ -92,10 +92,10 @@ def configured_proxy(folder, secrets, port, upstreams):
     return folder / "nginx.conf"
 
 
-@pytest.fixture(scope="module")
+@fixture(scope="module")
 def proxied(tmp_path_factory):
     if shutil.which("nginx") is None:
-        pytest.skip("nginx is not installed")
+        skip("nginx is not installed")
     folder = tmp_path_factory.mktemp("proxy")
     secrets, upstream, port = folder / "secrets", free_port(), free_port()
     make_secrets(secrets)
@@ -133,13 +133,13 @@ def test_the_service_is_reached_over_new_tls_with_hsts_only(proxied):
     context = ssl.create_default_context(cafile=str(proxied.certificate))
     context.set_ciphers("ALL:@SECLEVEL=0")
     context.options &= ~ssl.OP_NO_TLSv1_1
-    with pytest.warns(DeprecationWarning):
+    with warns(DeprecationWarning):
         context.minimum_version, context.maximum_version = ssl.TLSVersion.TLSv1_1, ssl.TLSVersion.TLSv1_1
-    with pytest.raises(httpx.ConnectError, match=r"(?i)protocol|alert"):
+    with raises(httpx.ConnectError, match=r"(?i)protocol|alert"):
         httpx.get(f"{proxied.url}/", verify=context)
 
 
-@pytest.mark.parametrize("path", ["/metrics", "/healthz", "/readyz"])
+@mark.parametrize("path", ["/metrics", "/healthz", "/readyz"])
 def test_metrics_and_health_are_not_passed_on(proxied, path):
     with proxied.client() as client:
         assert client.get(path).status_code == 404

@@ -4,7 +4,7 @@ import hashlib
 import math
 
 import numpy as np
-import pytest
+from pytest import approx, fixture, mark
 
 from linna.cli import GROUPS, run
 from linna.help import example
@@ -41,7 +41,7 @@ def test_a_downlinked_map_is_compared_with_a_catalogue(tmp_path, typed):
     downlink.write_bytes(landmarks_packet([10.01, 20.0]))
     figures = typed(f"catalogue landmarks {downlink} --catalogue {path} --json")
     assert (figures["landmarks"], figures["in_catalogue"], figures["new"]) == (2, 1, 1)
-    assert figures["median_horizontal_m"] == pytest.approx(303.2, abs=1.0)
+    assert figures["median_horizontal_m"] == approx(303.2, abs=1.0)
 
 
 def test_a_downlink_without_a_map_has_none_and_says_so(tmp_path, typed):
@@ -75,7 +75,7 @@ def test_a_list_is_registered_to_terrain(tmp_path, typed):
     assert (figures["rims"], figures["out"]) == (25, str(out))
     made = parse_registration(out.read_text(), "made")
     shift, sigma = made.at(np.radians([5.0]), np.radians([305.0]))
-    assert shift[0] == pytest.approx([0.0, 50.0], abs=8.0) and sigma[0] < 20.0
+    assert shift[0] == approx([0.0, 50.0], abs=8.0) and sigma[0] < 20.0
     assert made.terrain == {"bowls.tif": hashlib.sha256(raster.read_bytes()).hexdigest()}
     assert made.catalogue == hashlib.sha256(path.read_bytes()).hexdigest()
 
@@ -90,8 +90,8 @@ def test_an_empty_result_is_status_1_and_no_file(tmp_path):
     assert not out.exists()
 
 
-@pytest.mark.parametrize(
-    ("arguments", "expected"),
+@mark.parametrize(
+    "arguments, expected",
     [
         ("register", "CATALOGUE: expected a crater list"),
         ("register none.csv", "--terrain: expected height rasters"),
@@ -104,7 +104,7 @@ def test_bad_input_is_one_line_that_names_it(arguments, expected, typed, monkeyp
     assert expected in typed(f"catalogue {arguments}", 2)
 
 
-@pytest.fixture
+@fixture
 def recording(tmp_path):
     path = tmp_path / "station.cadu"
     path.write_bytes(encode_cadus(make_packets(120), spacecraft_id=76))
@@ -120,7 +120,7 @@ def test_settings_come_with_their_evidence(recording, typed):
     assert best["packets"] > 100
 
 
-@pytest.mark.parametrize(("randomiser", "status"), [("legacy", 0), ("long", 1)])
+@mark.parametrize("randomiser, status", [("legacy", 0), ("long", 1)])
 def test_a_mission_description_is_compared(recording, typed, tmp_path, randomiser, status):
     mission = tmp_path / "mission.toml"
     mission.write_text(f'name = "test"\n[link]\nframe_length = 1115\nrandomiser = "{randomiser}"\n')
@@ -146,7 +146,7 @@ def test_packets_without_frames_are_reported_and_noise_is_refused(typed, tmp_pat
     assert "expected CADUs or space packets, found none in its 5000 octets" in typed(f"link check {path}", 2)
 
 
-@pytest.mark.parametrize("prefix", [0, 3])
+@mark.parametrize("prefix", [0, 3])
 def test_the_form_of_packets_without_checksum_is_proposed(typed, tmp_path, prefix):
     packets = [bytes(prefix) + pack_packet(0x200, bytes(range(60)), sequence_count=k) for k in range(30)]
     path = tmp_path / "foreign.bin"
@@ -203,7 +203,7 @@ link check F --mission M
 """
 
 
-@pytest.mark.parametrize("line", RELIED_ON.strip().splitlines())
+@mark.parametrize("line", RELIED_ON.strip().splitlines())
 def test_a_documented_command_is_understood(line):
     words = line.split()
     command_parser(GROUPS, words[0]).parse_args(words)

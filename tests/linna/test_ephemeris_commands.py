@@ -3,7 +3,7 @@
 from dataclasses import replace
 
 import numpy as np
-import pytest
+from pytest import approx, fixture, mark
 
 from lunar.catalogue import PAPER_CLASS_COUNTS
 from lunar.constants import NS
@@ -13,14 +13,14 @@ from lunar.messages.stk import format_stk
 from tests.lunar.orbits import polar_orbit
 
 
-@pytest.fixture(autouse=True)
+@fixture(autouse=True)
 def no_data(monkeypatch, tmp_path):
     """These commands must work on a machine without the data products."""
     monkeypatch.delenv("LINNA_DATA", raising=False)
     monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path / "nothing"))
 
 
-@pytest.fixture
+@fixture
 def oem_path(tmp_path):
     path = tmp_path / "orbit.oem"
     save_oem(polar_orbit(48.0), path)
@@ -32,9 +32,9 @@ def test_compare_tells_the_difference_of_an_oem_and_an_stk_file(oem_path, tmp_pa
     other.write_text(format_stk(polar_orbit(48.0, radius_m=1_768_190.0)))
     figures = typed(f"orbit compare {oem_path} {other} --json")
     assert figures["samples"] == 48 * 60 + 1
-    assert figures["max_m"] == pytest.approx(10.0, abs=1e-5)
-    assert figures["rms_rtn_m"] == pytest.approx([10.0, 0.0, 0.0], abs=1e-5)
-    assert figures["mean_rtn_m"] == pytest.approx([10.0, 0.0, 0.0], abs=1e-5)
+    assert figures["max_m"] == approx(10.0, abs=1e-5)
+    assert figures["rms_rtn_m"] == approx([10.0, 0.0, 0.0], abs=1e-5)
+    assert figures["mean_rtn_m"] == approx([10.0, 0.0, 0.0], abs=1e-5)
     text = typed(f"orbit compare {oem_path} {other} --step 3600")
     assert text.startswith(
         "A: SELENITA, epochs in UTC; B: SELENITA, epochs in UTC\n49 epochs from 2029-08-07T00:00:00.000Z"
@@ -42,7 +42,7 @@ def test_compare_tells_the_difference_of_an_oem_and_an_stk_file(oem_path, tmp_pa
     assert "mean radial 10 m, transverse" in text and "rms  radial 10 m, transverse" in text
 
 
-@pytest.mark.parametrize("ending", [".oem", ".xml", ".e", ".csv", ".tum"])
+@mark.parametrize("ending", [".oem", ".xml", ".e", ".csv", ".tum"])
 def test_an_ephemeris_converts_to_every_format(oem_path, tmp_path, typed, ending):
     out = tmp_path / f"converted{ending}"
     assert typed(f"orbit convert {oem_path} --out {out} --json")["states"] == 2881
@@ -64,7 +64,7 @@ def test_an_ephemeris_goes_through_spice_and_back(oem_path, tmp_path, typed):
     assert typed(f"orbit compare {oem_path} {back} --json")["max_m"] < 1e-3
 
 
-@pytest.mark.parametrize(("ending", "count"), [(".oem", 242), (".csv", 223), (".tum", 223), (".e", 223)])
+@mark.parametrize("ending, count", [(".oem", 242), (".csv", 223), (".tum", 223), (".e", 223)])
 def test_a_conversion_prints_as_many_states_as_it_writes(tmp_path, typed, ending, count):
     """Two arcs of 121 states share an epoch; 20 states of the second are beyond its useable interval."""
     first = polar_orbit(2.0).segments[0]
@@ -101,8 +101,8 @@ def test_interpolate_gives_states_at_the_epochs_of_a_file(oem_path, tmp_path, ty
     first, second = figures["states"]
     assert set(first) == {*("epoch", "position_km", "velocity_km_s", "latitude_deg", "longitude_deg", "altitude_km")}
     assert second["epoch"] == "2029-08-07T12:34:56.789123000Z"
-    assert np.linalg.norm(second["position_km"]) == pytest.approx(1768.18, abs=1e-6)
-    assert first["altitude_km"] == pytest.approx(30.78, abs=1e-6)
+    assert np.linalg.norm(second["position_km"]) == approx(1768.18, abs=1e-6)
+    assert first["altitude_km"] == approx(30.78, abs=1e-6)
     assert abs(first["latitude_deg"]) < 0.1
     assert len(typed(f"orbit interpolate {oem_path} --epochs {epochs}").splitlines()) == 3
 

@@ -4,8 +4,7 @@ import csv
 import importlib.util
 import json
 
-import pytest
-from pytest import fixture
+from pytest import MonkeyPatch, fixture
 
 from linna.cli import run
 from lunar.datafolder import find_data
@@ -21,7 +20,7 @@ SMALL = Effort(
 def document(tmp_path_factory):
     out = tmp_path_factory.mktemp("paper") / "paper"
     lines = []
-    with pytest.MonkeyPatch.context() as patch:
+    with MonkeyPatch.context() as patch:
         find_spec = importlib.util.find_spec
         patch.setattr(importlib.util, "find_spec", lambda name, *a: None if name == "torch" else find_spec(name, *a))
         patch.setattr(paper_steps, "QUICK", SMALL)

@@ -4,9 +4,10 @@ import gzip
 import math
 
 import numpy as np
-import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from numpy.testing import assert_array_equal
+from pytest import approx, mark, raises
 
 from lunar import catalogue
 from lunar.catalogue import (
@@ -51,7 +52,7 @@ def test_the_index_finds_what_brute_force_finds(latitude, longitude, radius_m):
     assert set(found) <= set(np.flatnonzero(distance < radius_m + slack))
 
 
-@pytest.mark.parametrize("place_deg", [(0.0, 0.0), (0.0, 360.0), (10.0, -0.1), (90.0, 12.0), (-89.5, 200.0)])
+@mark.parametrize("place_deg", [(0.0, 0.0), (0.0, 360.0), (10.0, -0.1), (90.0, 12.0), (-89.5, 200.0)])
 def test_the_index_holds_over_the_meridian_and_at_the_poles(place_deg):
     latitude, longitude = np.radians(place_deg)
     distance = distances_m(latitude, longitude)
@@ -88,7 +89,7 @@ def test_our_own_file_gives_back_what_was_saved(tmp_path):
     assert (tmp_path / "again.csv").read_bytes() == path.read_bytes()
 
 
-@pytest.mark.real_data
+@mark.real_data
 def test_published_catalogues_have_the_class_counts_of_their_readme(data_path):
     whole, composite, robbins = (
         load_catalogue(data_path / "craters" / name)
@@ -99,7 +100,7 @@ def test_published_catalogues_have_the_class_counts_of_their_readme(data_path):
     # 222,451 and 52,554 lines, of which four and two repeat the place and diameter of another.
     assert (len(whole), len(composite), len(robbins)) == (222_447, 52_552, 6_973)
     assert whole.longitude_rad.min() >= 0.0 and whole.longitude_rad.max() < 2 * np.pi
-    assert np.nanmedian(whole.depth_m / whole.diameter_m) == pytest.approx(0.1, abs=0.05)
+    assert np.nanmedian(whole.depth_m / whole.diameter_m) == approx(0.1, abs=0.05)
     assert robbins.diameter_m.min() >= 20e3
 
 
@@ -119,7 +120,7 @@ def test_completing_fills_the_empty_tiles_up_to_the_papers_counts():
     whole = completed_to_paper(east, 1)
     assert tuple(class_counts(whole)) == PAPER_CLASS_COUNTS
     assert np.all(whole.longitude_rad[whole.ids < 0] >= np.pi)
-    with pytest.raises(LunarError, match="empty tiles"):
+    with raises(LunarError, match="empty tiles"):
         completed_to_paper(paper_density_catalogue(1), 1)
 
 
@@ -137,12 +138,12 @@ id,lat,lon,diam/7,1,2,3/7,1,3,3 | lines 2 and 3, column id: expected an id of it
 """
 
 
-@pytest.mark.parametrize("row", FAULTS.strip("\n").splitlines())
+@mark.parametrize("row", FAULTS.strip("\n").splitlines())
 def test_a_faulty_file_is_refused_with_file_line_and_what_was_found(tmp_path, row):
     text, place = row.split(" | ")
     path = tmp_path / "faulty.csv"
     path.write_text(text.replace("/", "\n"))
-    with pytest.raises(DataFileError) as caught:
+    with raises(DataFileError) as caught:
         load_catalogue(path)
     assert str(caught.value).startswith(f"{path}: {place}") and "\n" not in str(caught.value)
 
@@ -151,11 +152,11 @@ def test_a_missing_file_a_folder_and_a_cut_gzip_are_refused(tmp_path):
     cut = tmp_path / "cut.csv.gz"
     cut.write_bytes(gzip.compress(b"lat,lon,diam\n" + b"1,2,3\n" * 1000)[:-20])
     for path in (tmp_path / "none.csv", tmp_path, cut):
-        with pytest.raises(DataFileError, match="expected"):
+        with raises(DataFileError, match="expected"):
             load_catalogue(path)
 
 
-@pytest.mark.parametrize("quote", ["", '"'])
+@mark.parametrize("quote", ["", '"'])
 def test_a_file_is_read_by_blocks_and_a_fault_has_its_line(tmp_path, monkeypatch, quote):
     rows = [f"{k},{k % 60}.25,{k}.5,{5000 + k},{quote}1{quote},,1" for k in range(200)]
     head = "id,latitude_deg,longitude_deg,diameter_m,rim_height_m,depth_m,complete"
@@ -167,13 +168,13 @@ def test_a_file_is_read_by_blocks_and_a_fault_has_its_line(tmp_path, monkeypatch
     found = load_catalogue(path)
     assert len(found) == 200
     for name in ("ids", "latitude_rad", "longitude_rad", "diameter_m", "rim_height_m", "complete"):
-        np.testing.assert_array_equal(getattr(found, name), getattr(whole, name))
+        assert_array_equal(getattr(found, name), getattr(whole, name))
     path.write_text(text.replace(",5150,", ",x,"))
-    with pytest.raises(DataFileError, match="line 152, column diameter_m"):
+    with raises(DataFileError, match="line 152, column diameter_m"):
         load_catalogue(path)
     monkeypatch.setattr(catalogue, "ROWS_LIMIT", 199)
     path.write_text(text)
-    with pytest.raises(DataFileError, match="at most 199 craters"):
+    with raises(DataFileError, match="at most 199 craters"):
         load_catalogue(path)
 
 
@@ -190,7 +191,7 @@ def test_quoted_values_are_read_too(tmp_path):
     path = tmp_path / "quoted.csv"
     path.write_text('"lat","lon","diam"\n"1.5","-10","25"\n')
     catalogue = load_catalogue(path)
-    assert np.degrees(catalogue.longitude_rad) == pytest.approx([350.0])
+    assert np.degrees(catalogue.longitude_rad) == approx([350.0])
 
 
 OWN = """id,latitude_deg,longitude_deg,diameter_m,rim_height_m,depth_m,complete
@@ -200,7 +201,7 @@ OWN = """id,latitude_deg,longitude_deg,diameter_m,rim_height_m,depth_m,complete
 """
 
 
-@pytest.mark.parametrize("identity, old, new, message", [
+@mark.parametrize("identity, old, new, message", [
     ("1", "", "", "lines 2 and 3, column id: expected an id of its own for each crater .* found 1 twice"),
     ("1.7", "", "", "line 3, column id: expected a whole number, found 1.7"),
     ("3", ",112.0,", ",1737512.0,", "line 2: expected a rim height"),
@@ -210,7 +211,7 @@ OWN = """id,latitude_deg,longitude_deg,diameter_m,rim_height_m,depth_m,complete
 def test_two_craters_of_one_id_and_impossible_values_are_refused(tmp_path, identity, old, new, message):
     path = tmp_path / "own.csv"
     path.write_text(OWN.replace("\n1,-36", f"\n{identity},-36").replace(old or "?", new))
-    with pytest.raises(DataFileError, match=message):
+    with raises(DataFileError, match=message):
         load_catalogue(path)
 
 
@@ -242,8 +243,8 @@ def test_ids_rim_heights_and_flags_are_read_in_every_list_that_has_them(tmp_path
     assert not own.complete.any() and load_catalogue(path).complete.all()
 
 
-@pytest.mark.parametrize("column", ["latitude_deg", "longitude_deg", "diameter_m", "rim_height_m", "depth_m"])
-@pytest.mark.parametrize("factor", [1e-3, 1e3, math.pi / 180.0])
+@mark.parametrize("column", ["latitude_deg", "longitude_deg", "diameter_m", "rim_height_m", "depth_m"])
+@mark.parametrize("factor", [1e-3, 1e3, math.pi / 180.0])
 def test_a_column_in_another_unit_is_refused(tmp_path, column, factor):
     rng = np.random.default_rng(3)
     diameter_m = 3_000.0 * (1.0 - rng.random(60)) ** -0.5
@@ -266,5 +267,5 @@ def test_a_column_in_another_unit_is_refused(tmp_path, column, factor):
             return
         changed = ["latitude_deg", "longitude_deg"]  # angles come in one unit
     changes = {name: table[name] * factor for name in changed}
-    with pytest.raises(DataFileError, match="expected"):
+    with raises(DataFileError, match="expected"):
         written(table | changes)

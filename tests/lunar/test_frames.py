@@ -12,6 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy import allclose, count_nonzero, exp, eye
 from numpy.linalg import norm
+from numpy.testing import assert_array_equal
 from pytest import approx, fixture, mark, raises
 
 from lunar.constants import ASTRONOMICAL_UNIT_M, EARTH_RADIUS_M, MOON_RADIUS_M, NS, SPEED_OF_LIGHT_M_S, SUN_RADIUS_M
@@ -237,7 +238,7 @@ def test_signs_of_successive_quaternions_do_not_flip(count):
     angle = 0.3 * np.arange(count)
     smooth = np.stack([np.cos(angle), np.sin(angle), 0.0 * angle, 0.0 * angle], axis=1)
     flipped = smooth * np.where(np.arange(count) % 3 == 1, -1.0, 1.0)[:, None]
-    np.testing.assert_array_equal(continuous_quaternions(flipped), smooth)
+    assert_array_equal(continuous_quaternions(flipped), smooth)
 
 
 @fixture(scope="module")

@@ -4,8 +4,7 @@ import functools
 from typing import Any
 
 import numpy as np
-import pytest
-from pytest import fixture
+from pytest import MonkeyPatch, fixture
 
 from lunar.elements import Elements, icrf_state_from_elements
 from lunar.frames import IauOrientation
@@ -32,7 +31,7 @@ def drawn_moons():
             moons[seed] = craters(rng, map_of_plains, seed)
         return moons[seed]
 
-    with pytest.MonkeyPatch.context() as patch:
+    with MonkeyPatch.context() as patch:
         patch.setattr(procedural, "_plains_map", lambda salts: kept(tuple(salts)))
         patch.setattr(procedural, "_draw_catalogue", draw)
         yield plains, craters

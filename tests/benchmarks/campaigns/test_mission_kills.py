@@ -6,8 +6,7 @@ import sys
 import threading
 from pathlib import Path
 
-import pytest
-from pytest import approx, mark, raises
+from pytest import MonkeyPatch, approx, mark, raises
 
 from benchmarks._servers import PidFile, PostgresServer
 from benchmarks.campaigns._kills import PHASES, Keeper, Kill, PlannedKill, plan_kills
@@ -103,7 +102,7 @@ def test_a_spacecraft_is_started_again_after_the_kill_has_ended():
     left, right = socket.socketpair()
     spacecraft = KillableSpacecraft.__new__(KillableSpacecraft)
     spacecraft.__dict__ |= {"_part": SlowPart(), "_lock": threading.Lock(), "_console": left}
-    with left, right, pytest.MonkeyPatch.context() as patch:
+    with left, right, MonkeyPatch.context() as patch:
         patch.setattr(KillableSpacecraft, "_disconnect", lambda _: None)
         killer = threading.Thread(target=spacecraft.kill)
         killer.start()

@@ -7,6 +7,7 @@ import shutil
 from pathlib import Path
 
 import numpy as np
+from numpy.testing import assert_allclose
 from pytest import fixture, mark, raises
 
 from ground_service.client.connection import NotFound as NotFoundThere
@@ -107,9 +108,7 @@ def test_a_pass_is_evaluated_in_the_orientation_that_it_declares(synthetic_pass,
         latitude = np.radians(shift.latitude_deg)
     moved = shift.error_rtn_m - np.array([30.0, -40.0, 120.0])
     radius_m = 1_767_400.0
-    np.testing.assert_allclose(
-        np.linalg.norm(moved, axis=1), radius_m * math.radians(0.01) * np.cos(latitude), rtol=2e-3
-    )
+    assert_allclose(np.linalg.norm(moved, axis=1), radius_m * math.radians(0.01) * np.cos(latitude), rtol=2e-3)
 
 
 def test_declared_models_are_used_and_others_are_named_as_missing():
@@ -185,7 +184,7 @@ def test_an_attitude_message_is_interpolated_to_the_times_of_the_images(syntheti
     # A quaternion turns vectors: by 2 degrees in 10 s.
     rotations = rotations[:9] @ first_nadir(synthetic_pass).T
     angles = np.degrees(np.arctan2(rotations[:, 1, 0], rotations[:, 0, 0]))
-    np.testing.assert_allclose(angles, 3.0 * np.arange(9), atol=1e-9)
+    assert_allclose(angles, 3.0 * np.arange(9), atol=1e-9)
 
 
 def test_attitudes_are_not_interpolated_over_a_gap():

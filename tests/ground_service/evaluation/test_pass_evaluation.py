@@ -9,9 +9,8 @@ import math
 from dataclasses import replace
 
 import numpy as np
-import pytest
 from numpy.testing import assert_allclose, assert_array_equal
-from pytest import approx
+from pytest import approx, fixture, mark
 
 from ground_service.evaluation.core import PassInputs, _imaging_arcs, _joined, evaluate_pass, summary_of
 from ground_service.evaluation.fixes import IdentificationSamples, MappedCraters
@@ -199,7 +198,7 @@ def evaluated(**changed):
     return evaluate_pass(inputs(**changed))
 
 
-@pytest.fixture(scope="module")
+@fixture(scope="module")
 def report():
     return evaluated()
 
@@ -316,8 +315,8 @@ def test_the_filter_is_smoothed_in_icrf_with_its_own_field():
     assert summary_of(report)["smoothed"]["smoothed"]["end_of_pass_m"] == approx(30.0, abs=0.2)
 
 
-@pytest.mark.parametrize(
-    ("changed", "reasons"),
+@mark.parametrize(
+    "changed, reasons",
     [
         ({}, ["no field or orientation on board is given"]),
         ({"refused": {"onboard_gravity": "field X is not here"}}, ["field X is not here"]),
@@ -614,9 +613,7 @@ def test_the_headline_is_that_of_the_declared_estimator(report):
     ]
 
 
-@pytest.mark.parametrize(
-    ("estimator", "reason"), [(None, "no estimator is declared"), ("spherical", "spherical is not known")]
-)
+@mark.parametrize("estimator, reason", [(None, "no estimator is declared"), ("spherical", "spherical is not known")])
 def test_no_other_estimator_stands_in_for_the_declared_one(estimator, reason):
     report = evaluated(limits=Requirements(estimator=estimator), detections=no_detections())
     assert [(one.value, one.note) for one in report.headline[::2]] == [
@@ -625,7 +622,7 @@ def test_no_other_estimator_stands_in_for_the_declared_one(estimator, reason):
     assert (report.headline[3].value, report.headline[3].note) == (None, "not evaluated")
 
 
-@pytest.mark.parametrize(("error_m", "text"), [(9_940.0, "9940 m"), (9_960.0, "10.0 km"), (52_340.0, "52.3 km")])
+@mark.parametrize("error_m, text", [(9_940.0, "9940 m"), (9_960.0, "10.0 km"), (52_340.0, "52.3 km")])
 def test_lengths_from_ten_kilometres_on_are_in_kilometres(error_m, text):
     high = paper(altitude_m=np.full(FRAMES, ALTITUDE_M + error_m), longitude_deg=LONGITUDE_DEG)
     report = evaluated(navigation=(high,))

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import uvicorn
+from numpy.testing import assert_array_equal
 from pytest import approx, fixture, mark, raises
 
 import docs_site
@@ -101,7 +102,7 @@ def test_a_home_folder_is_opened_and_its_tables_have_the_types_of_their_columns(
         assert (str(detections["crater_id"].dtype), str(detections["u_px"].dtype)) == ("int64", "float64")
         assert one.states.loc[one.states["estimator"] == "paper", "sigma_r_m"].isna().all()
         tree = one.dataset()
-        np.testing.assert_array_equal(tree["detections"]["u_px"].values, detections["u_px"].to_numpy())
+        assert_array_equal(tree["detections"]["u_px"].values, detections["u_px"].to_numpy())
         with raises(UsageError, match=r"table: expected states, residuals.*, found 'statse'"):
             one.table("statse")
 

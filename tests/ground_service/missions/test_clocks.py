@@ -4,7 +4,7 @@ import struct
 import time
 from argparse import Namespace
 
-import pytest
+from pytest import fixture, mark, raises
 
 from ground_service.access.service import LOCAL_CALLER, session_of
 from ground_service.app import create_app
@@ -48,7 +48,7 @@ def state(ground, clock, number=76):
     add_mission(ground, TEXT.format(name=f"m{number}", number=number, clock=clock).encode())
 
 
-@pytest.fixture(autouse=True)
+@fixture(autouse=True)
 def _wall_clock_again():
     yield
     follow_missions(None)
@@ -140,11 +140,11 @@ def test_a_worker_and_a_scheduler_have_the_clock_of_the_service(ground):
         assert abs(seconds_after_start()) < 600.0
 
 
-@pytest.mark.parametrize(
+@mark.parametrize(
     "clock", ['source = "simulated"', 'source = "wall", mission = "2029-08-07T06:00:00Z"', 'source = "moon"']
 )
 def test_an_incomplete_clock_is_refused(clock):
-    with pytest.raises(InvalidInput, match="mission_clock"):
+    with raises(InvalidInput, match="mission_clock"):
         parse_mission(TEXT.format(name="m", number=1, clock=clock))
 
 

@@ -2,7 +2,7 @@
 
 import threading
 
-import pytest
+from pytest import fixture, mark
 from sqlalchemy import delete
 
 from ground_service.passes import series
@@ -43,7 +43,7 @@ class Archive:
             return cache.answer("answer", self.make, start_ticks=START, stop_ticks=STOP, state=state)
 
 
-@pytest.fixture
+@fixture
 def archive(ground):
     return Archive(ground)
 
@@ -58,7 +58,7 @@ def test_an_answer_is_kept_while_data_of_other_intervals_and_vehicles_come(archi
     assert archive.ask() == 1
 
 
-@pytest.mark.parametrize("first, last", [(0, START), (STOP, STOP + 9), (None, None), (1200, 1300)])
+@mark.parametrize("first, last", [(0, START), (STOP, STOP + 9), (None, None), (1200, 1300)])
 def test_an_answer_is_made_again_with_new_data_of_its_interval(archive, first, last):
     assert archive.ask() == 1
     archive.telemetry(first, last)

@@ -6,6 +6,7 @@ from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
+from numpy.testing import assert_allclose, assert_array_equal
 from pytest import approx, fixture, mark, raises
 
 from ground_service.access.model import AuditFilter
@@ -344,15 +345,15 @@ def test_the_tables_hold_the_reference_at_on_board_times(reference):
     tables = loaded(activities)
     initial = unpack_initial_state(tables[9])
     assert initial.ticks == ticks_of(BEGIN)
-    np.testing.assert_allclose(initial.position_icrf_m, [1.768e6, 0.0, 0.0], atol=1e-3)
-    np.testing.assert_allclose(initial.velocity_icrf_m_s, [0.0, 0.0, 1664.97], atol=0.01)
+    assert_allclose(initial.position_icrf_m, [1.768e6, 0.0, 0.0], atol=1e-3)
+    assert_allclose(initial.velocity_icrf_m_s, [0.0, 0.0, 1664.97], atol=0.01)
     assert (initial.sigma_position_m, initial.sigma_velocity_m_s) == (500.0, 0.5)
     assert state.utc_ns == BEGIN
     anchor = unpack_anchor_table(tables[1])
     assert anchor.ticks[0] == ticks_of(BEGIN - 120 * NS) and anchor.ticks[-1] >= ticks_of(STOP + 100 * NS)
     k = int(np.flatnonzero(anchor.ticks == ticks_of(BEGIN))[0])
     expected = IauOrientation().mcmf_from_icrf(float(tdb_s_from_utc_ns(BEGIN))) @ [1.768e6, 0.0, 0.0]
-    np.testing.assert_allclose(anchor.position_mcmf_m[k], expected, atol=0.01)
+    assert_allclose(anchor.position_mcmf_m[k], expected, atol=0.01)
     orientation = unpack_orientation_table(tables[8])
     assert orientation.ticks[0] < ticks_of(BEGIN) < ticks_of(STOP) < orientation.ticks[-1]
 
@@ -363,18 +364,18 @@ def test_a_window_of_the_experiment_starts_from_the_stated_error_with_its_declar
     position = np.array([a.position_icrf_m - b[0][0] for a, b in zip(made, known, strict=True)])
     velocity = np.array([a.velocity_icrf_m_s - b[1][0] for a, b in zip(made, known, strict=True)])
     # 400 draws: the standard deviation of each axis is known to 3.5 %, its mean to 5 %.
-    np.testing.assert_allclose(position.std(axis=0), 1_000.0, rtol=0.12)
-    np.testing.assert_allclose(position.mean(axis=0), 0.0, atol=180.0)
-    np.testing.assert_allclose(velocity.std(axis=0), 1_000.0 * 2.0 * np.pi / 6_672.0, rtol=0.12)
+    assert_allclose(position.std(axis=0), 1_000.0, rtol=0.12)
+    assert_allclose(position.mean(axis=0), 0.0, atol=180.0)
+    assert_allclose(velocity.std(axis=0), 1_000.0 * 2.0 * np.pi / 6_672.0, rtol=0.12)
     again = experiment_state(reference, 1_000.0, BEGIN, 76)
-    np.testing.assert_array_equal(again.position_icrf_m, made[0].position_icrf_m)
+    assert_array_equal(again.position_icrf_m, made[0].position_icrf_m)
     assert (experiment_state(reference, 1e3, BEGIN, 77).position_icrf_m != again.position_icrf_m).all()
     stated = experiment_accuracy(ALL, 1_000.0, again)
     activities, state = prepared(reference, stated, again)
     initial = unpack_initial_state(loaded(activities)[9])
     assert state is again and initial.sigma_position_m == 1_000.0
     assert initial.sigma_velocity_m_s == approx(0.9417, rel=5e-3)
-    np.testing.assert_allclose(initial.position_icrf_m, again.position_icrf_m, atol=1e-3)
+    assert_allclose(initial.position_icrf_m, again.position_icrf_m, atol=1e-3)
 
 
 def test_standby_comes_first_then_the_tables_with_the_start_state_last_and_the_downlink_after_the_window(reference):

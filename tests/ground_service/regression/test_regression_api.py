@@ -5,7 +5,7 @@ from functools import partial
 from pathlib import Path
 from shutil import make_archive
 
-import pytest
+from pytest import mark
 
 from ground_service.regression.archives import pack_archive
 from linna.cli import run
@@ -73,7 +73,7 @@ def test_a_build_is_registered_held_against_another_and_judged(client, make_flya
     assert kinds.count("replay") == 2  # the good build's was not done again
 
 
-@pytest.mark.parametrize(
+@mark.parametrize(
     "body",
     [
         {"candidate": "../../etc/passwd"}, {"candidate": "0" * 64},

@@ -1,9 +1,9 @@
-import pytest
+from pytest import fixture
 
 from ground_service.store.database import prepare_database
 
 
-@pytest.fixture(params=["sqlite", "postgresql"])
+@fixture(params=["sqlite", "postgresql"])
 def database(request, tmp_path):
     if request.param == "sqlite":
         url = f"sqlite:///{tmp_path / 'linna.db'}"

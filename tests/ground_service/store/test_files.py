@@ -5,14 +5,14 @@ import subprocess
 import sys
 from pathlib import Path
 
-import pytest
+from pytest import fixture, raises
 from sqlalchemy import text
 
 from ground_service.ground import open_ground
 from ground_service.store.files import FileArchive, make_durable_folder, replace_durably
 
 
-@pytest.fixture
+@fixture
 def ended_process():
     """Return the id of a process that has ended."""
     process = subprocess.Popen([sys.executable, "-c", ""])
@@ -61,7 +61,7 @@ def test_leftovers_of_ended_processes_are_removed_at_the_start(tmp_path, ended_p
         yield Path(next((tmp_path / "files").glob(".incoming-*"))).name.encode()
         raise KeyboardInterrupt
 
-    with pytest.raises(KeyboardInterrupt):
+    with raises(KeyboardInterrupt):
         files.put(interrupted())
     assert not list(files.root.glob(".incoming-*")), "an aborted upload leaves nothing"
 

@@ -4,6 +4,7 @@ import re
 from urllib.parse import quote_plus
 
 import pytest
+from pytest import approx, fixture
 
 from ground_service.evaluation.service import make_report
 from ground_service.ground import open_ground
@@ -15,7 +16,7 @@ from tests.ground_service.web.test_in_browser import answered, colour_of, settle
 from tests.lazy import expect
 
 
-@pytest.fixture(scope="module")
+@fixture(scope="module")
 def compared(tmp_path_factory, make_pass, console, serve):
     """A service with two passes that have reports, and one that has none."""
     home = tmp_path_factory.mktemp("compared") / "home"
@@ -29,7 +30,7 @@ def compared(tmp_path_factory, make_pass, console, serve):
         yield running
 
 
-@pytest.fixture
+@fixture
 def view(browser, compared):
     """A page of the service."""
     with strict_page(browser, compared.url, strict=False) as page:
@@ -61,10 +62,10 @@ def test_passes_chosen_on_the_list_are_compared_side_by_side(view):
     expect(view.get_by_label("Navigation solution")).to_have_value(estimator)
     medians = [one["navigation"][estimator]["median_3d_m"] for one in figures]
     first, second, change = row(view, f"Median error, {estimator}, m")
-    assert [float(first), float(second)] == pytest.approx(medians, rel=6e-3)  # three figures
-    assert change == "±0" and medians[0] == pytest.approx(medians[1], rel=1e-3)  # the same errors were put in
+    assert [float(first), float(second)] == approx(medians, rel=6e-3)  # three figures
+    assert change == "±0" and medians[0] == approx(medians[1], rel=1e-3)  # the same errors were put in
     high = [one["conditions"]["altitude_km"] for one in figures]
-    assert [*map(float, row(view, "Altitude, km")[:2])] == pytest.approx(high, rel=6e-3)
+    assert [*map(float, row(view, "Altitude, km")[:2])] == approx(high, rel=6e-3)
     assert row(view, "Sun elevation, deg") == ["unknown", "unknown", ""]
     expect(view.locator("#figures thead")).to_contain_text("synthetic pass (2)")
     assert row(view, "Frames") == ["40", "30", "−10"]

@@ -9,7 +9,7 @@ import time
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
-import pytest
+from pytest import fixture, skip
 from sqlalchemy import text
 
 from ground_service.access import service as users
@@ -77,11 +77,11 @@ class Server:
         return self.script("base-backup.sh", *place).stdout.strip()
 
 
-@pytest.fixture(scope="module")
+@fixture(scope="module")
 def server():
     """A server for all tests; the last one destroys and restores its database."""
     if not sorted(Path("/usr/lib/postgresql").glob("*/bin/postgres")):
-        pytest.skip("PostgreSQL is not installed")
+        skip("PostgreSQL is not installed")
     folder = Path(tempfile.mkdtemp(prefix="linna-recovery-"))
     made = Server(folder)
     if made.user:

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.linalg import norm
 from numpy.random import default_rng
+from numpy.testing import assert_array_equal
 from pytest import approx, mark
 from scipy.special import pdtrc
 
@@ -77,7 +78,7 @@ def test_a_place_kilometres_off_is_found_with_the_right_craters(east_m, north_m,
     found, owner = detected(landmarks, true, seed=seed)
     prior = pose_at(1_500.0 + east_m, -800.0 + north_m, ALTITUDE_M + up_m)
     fix = search(found, landmarks, prior, 5_000.0)
-    np.testing.assert_array_equal(owner[fix.detection], fix.index)
+    assert_array_equal(owner[fix.detection], fix.index)
     # Every true detection but those thrown far by the noise: 3.5 sigma in the first choice, mutual nearest later.
     assert fix.detection.size >= 0.9 * np.count_nonzero(owner >= 0)
     # Half a pixel is 100 m, averaged over a dozen craters, with the attitude among the unknowns.
@@ -91,7 +92,7 @@ def test_a_place_is_found_from_high_orbits(altitude_m):
     true = pose_at(1_500.0, -800.0, altitude_m)
     found, owner = detected(landmarks, true, seed=4)
     fix = search(found, landmarks, pose_at(7_500.0, -9_800.0, altitude_m + 2_000.0), 5_000.0)
-    np.testing.assert_array_equal(owner[fix.detection], fix.index)
+    assert_array_equal(owner[fix.detection], fix.index)
     # Half a pixel is 500 m at 150 km, averaged over dozens of craters.
     assert norm(fix.pose.position_icrf_m - true.position_icrf_m) < 600.0
 

@@ -3,6 +3,7 @@
 import math
 
 import numpy as np
+from numpy.testing import assert_allclose
 from pytest import approx, mark
 
 from lunar.camera import PinholeCamera
@@ -89,7 +90,7 @@ def test_the_planar_system_recovers_an_exact_planar_motion():
     match = Match(np.arange(10), np.arange(10), 10, True)
     motion = odometry.solve_planar(features[0], features[1], match, CAMERA, 15.0)
     # Rounding of a 20 x 3 least-squares problem with entries of 1e2 and right-hand sides of 1e6 m px.
-    np.testing.assert_allclose([motion.east_m, motion.north_m, motion.up_m], move, atol=1e-6)
+    assert_allclose([motion.east_m, motion.north_m, motion.up_m], move, atol=1e-6)
 
 
 def test_one_pair_locks_the_change_of_altitude_to_zero():

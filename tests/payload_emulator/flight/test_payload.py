@@ -3,6 +3,7 @@
 import re
 
 import numpy as np
+from numpy.testing import assert_allclose
 from pytest import approx, mark
 
 from payload_emulator.flight.navigation.outcomes import Mode
@@ -75,7 +76,7 @@ def test_each_frame_reports_detections_states_and_outcomes_of_every_estimator(mo
     assert [values["frame_number"] for values in detections] == [0, 1, 2, 3]
     assert [values["count"] for values in detections] == [len(frame) for frame in frames]
     # 1/64 px quantisation.
-    np.testing.assert_allclose(detections[2]["items"]["u_px"], frames[2].u_px, atol=1 / 128)
+    assert_allclose(detections[2]["items"]["u_px"], frames[2].u_px, atol=1 / 128)
     assert set(detections[2]["items"]["size_class"].tolist()) <= {0, 1, 2}
     outcomes = named(packets, "frame_outcome")
     assert [(v["estimator"], v["outcome"]) for v in outcomes[:2]] == [(0, 0), (1, 0)]

@@ -6,6 +6,7 @@ import struct
 import numpy as np
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from numpy.testing import assert_allclose
 from pytest import approx, mark
 
 from payload_emulator.flight.onboard.loads import TABLE_NUMBERS
@@ -279,7 +280,7 @@ def test_a_thumbnail_comes_down_as_large_data(rig):
     found = unpack_thumbnail(whole.octets)
     assert (found.frame_number, found.ticks, found.levels.shape) == (0, rig.ticks, (8, 8))
     expected = image.astype(float).mean(axis=2).reshape(8, 8, 8, 8).mean(axis=(1, 3))
-    np.testing.assert_allclose(found.levels, expected, atol=0.5)
+    assert_allclose(found.levels, expected, atol=0.5)
 
 
 def test_the_map_of_landmarks_has_its_documented_octets(rig):

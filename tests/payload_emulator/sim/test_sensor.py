@@ -404,17 +404,19 @@ def test_yaw_by_a_quarter_turn_turns_the_picture(procedural):
     assert np.percentile(difference, 99) < 1.0
 
 
-POSES = [
-    (10.5, 20.5, 15e3, 40.0, 100.0, 0.0, 0.0), (10.5, 20.5, 22e3, 4.0, -150.0, 2.0, 1.0),
-    (9.5, 21.0, 31e3, 9.0, 35.0, -2.0, 4.0), (10.0, 20.0, 46e3, 14.0, -20.0, 1.0, 2.5)
-]  # fmt: skip
+# latitude, longitude, altitude in m, elevation and azimuth of the Sun, tilt in degrees, yaw
+POSES = """10.5 20.5 15e3 40 100 0 0
+10.5 20.5 22e3 4 -150 2 1
+9.5 21 31e3 9 35 -2 4
+10 20 46e3 14 -20 1 2.5"""
 
 
 @mark.slow
 def test_fast_and_marched_pictures_agree(procedural):
     both_dark = any_dark = 0
     errors = []
-    for latitude, longitude, altitude, elevation, azimuth, tilt, yaw in POSES:
+    for row in POSES.splitlines():
+        latitude, longitude, altitude, elevation, azimuth, tilt, yaw = map(float, row.split())
         position, rotation = pose(latitude, longitude, altitude)
         rotation = axis_rotation(3, yaw) @ axis_rotation(1, radians(tilt)) @ rotation
         toward = sun(elevation, azimuth, latitude, longitude)

@@ -1,5 +1,6 @@
 """Transition from the raster to seeded relief: spectrum, craters, edges, threads."""
 
+import itertools
 import threading
 from math import log10, pi, radians, sin, sqrt
 
@@ -14,9 +15,7 @@ from payload_emulator.sim.terrain.opening import open_terrain
 from payload_emulator.sim.terrain.procedural import ProceduralTerrain
 
 PIXEL_M = radians(MOON_RADIUS_M) / 256.0
-BANDS_KM = (
-    (14, 20), (10, 14), (7, 10), (5, 7), (3.5, 5), (2.5, 3.5), (1.8, 2.5), (1.3, 1.8), (0.9, 1.3), (0.65, 0.9)
-)  # fmt: skip
+BANDS_KM = [*itertools.pairwise((20, 14, 10, 7, 5, 3.5, 2.5, 1.8, 1.3, 0.9, 0.65))]
 """Wavelengths on both sides of the join at 1.8 km; down to 3.5 km the raster itself can be believed."""
 
 BELIEVED = slice(0, 5)
@@ -37,7 +36,7 @@ def spectrum(terrain, latitude_deg, longitude_deg):
     window = np.hanning(n)[:, None]
     power = (np.abs(np.fft.rfft(heights * window, axis=0)) ** 2).mean(axis=1) * 2.0 * PIXEL_M / (window**2).sum()
     wave_km = 1.0 / np.maximum(np.fft.rfftfreq(n, PIXEL_M / 1000.0), 1e-9)
-    return np.array([np.log10(power[(wave_km >= a) & (wave_km < b)].mean()) for a, b in BANDS_KM])
+    return np.array([np.log10(power[(wave_km >= a) & (wave_km < b)].mean()) for b, a in BANDS_KM])
 
 
 @mark.real_data

@@ -197,9 +197,11 @@ def test_an_ellipse_in_the_image_keeps_its_box_and_area():
 
 
 # centre, box, share of the area
-BORDER = (
-    "0 40 0 30 10 50 .5,200 40 190 30 200 50 .5,100 0 90 0 110 10 .5,100 80 90 70 110 80 .5,200 80 190 70 200 80 .25"
-)
+BORDER = """0 40 0 30 10 50 .5
+200 40 190 30 200 50 .5
+100 0 90 0 110 10 .5
+100 80 90 70 110 80 .5
+200 80 190 70 200 80 .25"""
 
 
 @mark.parametrize("row", BORDER.splitlines())

@@ -5,7 +5,7 @@ import socket
 import threading
 from dataclasses import dataclass, field
 
-import pytest
+from pytest import fixture
 
 from ground_service.contacts.links import core, runner, service
 from ground_service.contacts.links.runner import LinkRunner
@@ -65,7 +65,7 @@ class Station:
 WAITS = {"TICK_S": 0.05, "PAUSE_S": 0.1, "RETRY_S": 0.1, "MISSED_S": 0.1, "REFUSED_S": 0.1}
 
 
-@pytest.fixture
+@fixture
 def station(monkeypatch):
     """A station whose link waits less than in operation, for events that the test causes."""
     for name, seconds in WAITS.items():

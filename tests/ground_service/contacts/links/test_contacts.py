@@ -1,9 +1,9 @@
 """Contacts from the geometry of a station, and decisions of a link."""
 
 import numpy as np
-import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from pytest import approx, fixture
 
 from ground_service.contacts.links.core import (
     BLOCK_NS,
@@ -28,7 +28,7 @@ ALWAYS = GroundStation("above the horizon", 0.0, 0.0, 0.0, np.radians(-90.0))
 MADRID = GroundStation("madrid", np.radians(40.43), np.radians(-4.25), 840.0, np.radians(10.0))
 
 
-@pytest.fixture(scope="module")
+@fixture(scope="module")
 def orbit():
     every = START + np.arange(0, 86_400 + 1, 60, dtype=np.int64) * NS
     return ephemeris_from_states(every, *circular_states(every))
@@ -97,7 +97,7 @@ def test_stations_are_those_of_the_mission_description():
     ).link
     near = station_of(section, "near")
     assert stations_of(section) == (near,)
-    assert near is not None and near.minimum_elevation_rad == pytest.approx(np.radians(5.0))
+    assert near is not None and near.minimum_elevation_rad == approx(np.radians(5.0))
     assert station_of(section, "far") is None and station_of(section, None) is None
     (span,) = outages_of(section)["near"]
     assert span[1] - span[0] == 6 * 3600 * NS

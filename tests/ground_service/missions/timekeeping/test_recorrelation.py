@@ -5,6 +5,7 @@ import json
 import random
 
 import numpy as np
+from numpy.testing import assert_allclose
 from pytest import approx, fixture, mark, raises
 from sqlalchemy import text
 
@@ -119,7 +120,7 @@ def test_every_boot_gets_its_line_and_every_derived_time_names_it(ground, spacec
         spacecraft_id=SPACECRAFT,
     )  # fmt: skip
     found = list_events(ground, key, Paging(limit=1000)).items
-    np.testing.assert_allclose([event.time.utc_ns for event in found], spacecraft.sent, atol=20_000)
+    assert_allclose([event.time.utc_ns for event in found], spacecraft.sent, atol=20_000)
     assert [event.correlation_id for event in found] == [rows[0].id] * 15 + [rows[1].id] * 15
     left = residuals(ground, vehicle)
     assert len(left) == REPORTS
@@ -235,7 +236,7 @@ def test_a_new_reference_ephemeris_gives_new_light_times(ground, spacecraft, tmp
     add_ephemeris(ground, ground.files.put_file(orbit), name="orbit")
     after = [one.light_time_s for one in residuals(ground, vehicle)]
     # From the Moon's centre to the orbit around it, which moves by 2 km while the light travels.
-    np.testing.assert_allclose(np.array(before) - after, nearer_m / SPEED_OF_LIGHT_M_S, atol=1e-5)
+    assert_allclose(np.array(before) - after, nearer_m / SPEED_OF_LIGHT_M_S, atol=1e-5)
     assert np.abs(nearer_m).max() > 1e5
     assert len(ground.read(correlations_in_force, vehicle)) == 2
     assert len(ground.read(correlations_on_record, vehicle)) == 4
