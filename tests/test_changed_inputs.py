@@ -24,10 +24,9 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-import pytest
 from numpy.linalg import norm
 from numpy.random import default_rng
-from pytest import mark
+from pytest import mark, skip
 
 from ground_service.errors import GroundError
 from ground_service.missions.ephemerides.service import check_attitudes, load_attitudes
@@ -587,7 +586,7 @@ def outcome(name, row, folder):
 @mark.parametrize("name", READERS)
 def test_a_changed_field_never_gives_other_figures_in_silence(name, tmp_path):
     if name == "orientation kernels" and "LINNA_DATA" not in os.environ:
-        pytest.skip("LINNA_DATA is not set: no kernels on this machine")
+        skip("LINNA_DATA is not set: no kernels on this machine")
     rows = changes_of(name)
     assert rows
     for number, row in enumerate(rows):

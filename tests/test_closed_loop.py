@@ -6,7 +6,7 @@ import json
 from contextlib import redirect_stdout
 from dataclasses import replace
 
-import pytest
+from pytest import MonkeyPatch, approx, fixture, mark
 
 from ground_service.evaluation.service import evaluate
 from ground_service.ground import open_ground
@@ -34,18 +34,18 @@ initial_velocity_error_m_s = 1.0
 FRAMES = 8
 
 
-@pytest.fixture(scope="module")
+@fixture(scope="module")
 def scenario_file(tmp_path_factory):
     file = tmp_path_factory.mktemp("scenario") / "closed-loop.toml"
     file.write_text(SCENARIO)
     return file
 
 
-@pytest.fixture(scope="module")
+@fixture(scope="module")
 def demo(scenario_file, tmp_path_factory):
     out, printed = tmp_path_factory.mktemp("demo"), io.StringIO()
     # Without data the ground turns the Moon as the scenario does: with another rotation places differ by 80 m.
-    with pytest.MonkeyPatch.context() as environment, redirect_stdout(printed):
+    with MonkeyPatch.context() as environment, redirect_stdout(printed):
         environment.delenv("LINNA_DATA", raising=False)
         assert cli.run(["demo", "--scenario", str(scenario_file), "--out", str(out), "--json"]) == 0
     return json.loads(printed.getvalue()), out
@@ -67,9 +67,9 @@ def test_the_demo_prints_the_agreed_keys_and_its_score_is_that_of_the_ground_wit
     score = json.loads((out / "pass" / "summary.json").read_text())["navigation"]["imaging_from_start"]
     flown = figures["navigation"]["anchored"]
     # One goes by full states and the truth, the other by reported places and the ephemeris on the ground.
-    assert score["median_m"] == pytest.approx(flown["median_3d_m"], abs=1.0)
-    assert score["max_m"] == pytest.approx(flown["max_3d_m"], abs=1.0)
-    assert figures["smoothed"]["smoothed"]["end_of_pass_m"] == pytest.approx(flown["end_of_pass_m"], abs=1.0)
+    assert score["median_m"] == approx(flown["median_3d_m"], abs=1.0)
+    assert score["max_m"] == approx(flown["max_3d_m"], abs=1.0)
+    assert figures["smoothed"]["smoothed"]["end_of_pass_m"] == approx(flown["end_of_pass_m"], abs=1.0)
 
 
 def test_the_manifest_hashes_what_lies_in_the_archive(demo):
@@ -120,7 +120,7 @@ drift_ppm = 5.0
 PLANTED = parse_scenario(live_scenario("planted", 3, 600.0) + LIMITS)
 
 
-@pytest.fixture(scope="module")
+@fixture(scope="module")
 def fly(tmp_path_factory):
     """Emulate a flight, import its archive and evaluate it."""
 
@@ -139,7 +139,7 @@ def statuses(report):
     return {one.key: one.status for one in report.requirements if one.status != "not judged"}
 
 
-@pytest.fixture(scope="module")
+@fixture(scope="module")
 def healthy(fly):
     return fly(PLANTED)
 
@@ -149,8 +149,8 @@ def test_a_healthy_pass_is_met(healthy):
     assert {"detector.recall", "pointing.offset", "time.step"} <= statuses(healthy).keys()
 
 
-@pytest.mark.parametrize(
-    ("fault", "requirement"),
+@mark.parametrize(
+    "fault, requirement",
     [
         ("camera bias of 0.5 px", "pointing.offset"), ("undeclared attitude bias of 0.2 deg", "pointing.offset"),
         ("recall of four fifths", "detector.recall"), ("clock step of 1 s", "time.step"),

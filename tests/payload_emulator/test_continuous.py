@@ -13,7 +13,7 @@ from types import SimpleNamespace
 from typing import Any, cast
 
 import numpy as np
-import pytest
+from pytest import approx, fixture, mark, raises
 
 from ground_service.missions.model import parse_mission
 from linna import cli
@@ -184,7 +184,7 @@ WINDOW = EPOCH + 7 * HOUR_NS + 37 * NS
 """Start of the window, whose frames lie between whole minutes; the scenario itself observes after its epoch."""
 
 
-@pytest.fixture(scope="module")
+@fixture(scope="module")
 def flight():
     """Sixteen hours with time reports and one window: the Moon is above the station for twelve of them."""
 
@@ -225,8 +225,8 @@ def test_the_clock_drifts_as_the_scenario_says_by_its_time_reports(flight):
     error_s = ticks / 65_536.0 - elapsed_s + 1.28
     drift, offset = np.polyfit((received - EPOCH) / NS, error_s, 1)
     # The light time of 1.18 to 1.36 s changes by some ms a day.
-    assert drift * 1e6 == pytest.approx(5.0, abs=0.5)
-    assert offset == pytest.approx(0.4, abs=0.15)
+    assert drift * 1e6 == approx(5.0, abs=0.5)
+    assert offset == approx(0.4, abs=0.15)
 
 
 def test_battery_and_temperature_follow_the_sun_and_outside_windows_no_image_is_made(flight):
@@ -274,8 +274,8 @@ def test_the_uplink_carries_no_more_than_its_rate():
     session, ground = flown(slow, 4.5, act)
     start, stop = (parse_utc(one["utc"]) for one in ground.contacts[:2])
     seconds, packet = (stop - start) / NS, len(ground.command("test_connection"))
-    assert session.account.telecommands == pytest.approx(seconds / packet, abs=2)
-    assert session.account.telecommand_octets_lost == pytest.approx(2_000 * packet - seconds, abs=2 * packet)
+    assert session.account.telecommands == approx(seconds / packet, abs=2)
+    assert session.account.telecommand_octets_lost == approx(2_000 * packet - seconds, abs=2 * packet)
 
 
 def test_an_exact_state_gives_the_same_flight_as_without_an_interruption(tmp_path):
@@ -386,7 +386,7 @@ def test_the_mission_description_names_stations_and_links():
     assert written.approval is not None and written.uploads is not None
 
 
-@pytest.mark.parametrize(("option", "limit"), [("--rate", "from"), ("--days", "above")])
+@mark.parametrize("option, limit", [("--rate", "from"), ("--days", "above")])
 def test_impossible_options_are_refused_in_one_line(option, limit, capsys):
     assert cli.run(["emulate", "low-over-mare", "--live", option, "-1"]) == 2
     assert f"{option}: expected a number {limit} 0, found '-1'" in capsys.readouterr().err
@@ -394,7 +394,7 @@ def test_impossible_options_are_refused_in_one_line(option, limit, capsys):
 
 def test_a_scenario_with_an_ephemeris_or_a_kidnap_is_refused():
     moved = "[disturbances]\nkidnap_distance_km = 10.0\n[maneuvers]\nenabled = false\n"
-    with pytest.raises(ScenarioError, match="expected an orbit to propagate without end, found a kidnap"):
+    with raises(ScenarioError, match="expected an orbit to propagate without end, found a kidnap"):
         opened(scenario(moved))
 
 
@@ -411,7 +411,7 @@ median_error_m = 42.0
 )
 
 
-@pytest.fixture(scope="module")
+@fixture(scope="module")
 def world():
     return build_world(parse_scenario(MISSION_SCENARIO), DataFolder())
 
@@ -440,7 +440,7 @@ def test_the_network_and_the_threshold_in_force_are_stated(world):
     stated = stated_of(changed).detector
     assert (stated.score_threshold, stated.max_detections) == (0.61, 80)
     lost = replace(world, scenario=replace(world.scenario, detector=DetectorSection(network="lost.onnx")))
-    with pytest.raises(ModelError, match=r"expected craters.* or an ONNX file, found 'lost.onnx'"):
+    with raises(ModelError, match=r"expected craters.* or an ONNX file, found 'lost.onnx'"):
         mission_text(lost, DataFolder())
 
 
@@ -454,12 +454,12 @@ def test_the_registration_of_the_terrain_is_stated(world):
     registration = fit_registration(Rims(*places, -20.0 * same, 40.0 * same, 60.0 * same))
     shifted = SimpleNamespace(catalogue=world.terrain.catalogue, is_real=False, registration=registration)
     stated = stated_of(replace(world, terrain=shifted)).catalogue
-    assert stated.registration_north_m == pytest.approx(40.0, abs=3.0)
-    assert stated.registration_east_m == pytest.approx(-20.0, abs=3.0)
+    assert stated.registration_north_m == approx(40.0, abs=3.0)
+    assert stated.registration_east_m == approx(-20.0, abs=3.0)
     assert 10.0 <= stated.registration_sigma_m < 20.0
     assert 0 < stated.registration_rims <= same.size
     known = np.isfinite(registration.at(latitude, longitude)[1])
-    assert stated.registered_share == pytest.approx(known.mean(), abs=5e-4) and known.any()
+    assert stated.registered_share == approx(known.mean(), abs=5e-4) and known.any()
     shifted.registration = fit_registration(Rims(places[0], places[1] + np.pi, same, same, 60.0 * same))
     stated = stated_of(replace(world, terrain=shifted)).catalogue
     assert stated.registered_share == 0.0 and stated.registration_sigma_m is None
@@ -470,7 +470,7 @@ def test_limits_and_the_offset_of_the_list_that_the_payload_starts_with_are_stat
     loaded = launch_payload(world.scenario, world.camera, DataFolder()).parameters.flight.anchored
     up_m = loaded.errors.catalogue_offset_m[2]
     assert stated.offset_sigma_m == (loaded.offset.prior_m, loaded.offset.prior_m, up_m)
-    assert np.radians(stated.offset_correlation_deg) == pytest.approx(loaded.offset.correlation_rad)
+    assert np.radians(stated.offset_correlation_deg) == approx(loaded.offset.correlation_rad)
     requirements = stated_of(world).requirements
     assert requirements.estimator == "anchored"
     assert (requirements.median_error_m, requirements.recall, requirements.memory_mib) == (42.0, None, None)
@@ -492,9 +492,7 @@ PLACES = """
 """
 
 
-@pytest.mark.parametrize(
-    ("latitude_deg", "longitude_deg", "seen"), [line.split(maxsplit=2) for line in PLACES.strip().splitlines()]
-)
+@mark.parametrize("latitude_deg, longitude_deg, seen", [line.split(maxsplit=2) for line in PLACES.strip().splitlines()])
 def test_ground_is_seen_where_the_recipe_of_the_shipped_detector_looked(latitude_deg, longitude_deg, seen):
     place = np.array([float(latitude_deg)]), np.array([float(longitude_deg)])
     assert any(region.contains(*place).all() for region in trained_ground()) is seen.startswith("seen")
@@ -542,8 +540,8 @@ def flown_over(longitudes_deg, is_real=True):
     )
 
 
-@pytest.mark.parametrize(
-    ("longitudes_deg", "share"),
+@mark.parametrize(
+    "longitudes_deg, share",
     [
         ([290.0, 292.0], 1.0),
         ([270.0], 0.0),

@@ -4,7 +4,7 @@ import math
 from dataclasses import replace
 
 import numpy as np
-import pytest
+from pytest import approx, fixture, mark, raises
 
 from lunar.catalogue import load_catalogue, make_catalogue
 from lunar.datafolder import find_data
@@ -66,12 +66,12 @@ class Field:
         return make_catalogue(np.radians(latitude), np.radians(longitude), size, source="list")
 
 
-@pytest.fixture(scope="module")
+@fixture(scope="module")
 def field():
     return Field()
 
 
-@pytest.fixture(scope="module")
+@fixture(scope="module")
 def curation(field):
     return curate(field.listed(), field)
 
@@ -115,7 +115,7 @@ def test_craters_are_dropped_for_one_reason_shallow_without_terrain_or_below_a_d
     assert not shallow & set(curation.table.ids.tolist())
     assert curation.dropped["shallow"] >= len(shallow)
     moved = replace(listed, latitude_rad=listed.latitude_rad + np.radians(20.0))
-    with pytest.raises(TerrainError, match="expected heights under some of"):
+    with raises(TerrainError, match="expected heights under some of"):
         curate(moved, field)
     half = replace(listed, latitude_rad=listed.latitude_rad + np.radians(3.0))
     assert curate(half, field).dropped["no_terrain"] > 0
@@ -129,7 +129,7 @@ def test_craters_are_dropped_for_one_reason_shallow_without_terrain_or_below_a_d
 def test_a_coarse_raster_is_corrected_for_low_rims_and_says_so(curation):
     coarse = Field(ppd=32.0)
     # One halving below 64 px/deg.
-    assert curate(coarse.listed(), coarse).height_correction_m == pytest.approx(20.0)
+    assert curate(coarse.listed(), coarse).height_correction_m == approx(20.0)
     assert curation.height_correction_m == 0.0
 
 
@@ -145,7 +145,7 @@ def test_the_table_survives_upload_and_its_sigmas_are_never_below_the_floor(cura
     assert np.all(table.sigma_m[:, :2] >= CurationRules().centre_sigma_m)
 
 
-@pytest.mark.real_data
+@mark.real_data
 def test_on_gld100_the_list_and_the_terrain_agree_to_half_a_pixel(data_path):
     data = find_data(data_path)
     tiles = [path for path in data.dem_tiles if "128ppd" in path.name]

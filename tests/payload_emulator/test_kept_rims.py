@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 from numpy import array_equal
+from numpy.testing import assert_allclose
 from pytest import fixture
 
 from lunar.catalogue import make_catalogue
@@ -126,6 +127,6 @@ def test_a_long_measurement_is_watched_in_parts_and_a_kept_one_is_not(monkeypatc
     whole = rims_of(SCENARIO, opened("other"), ALL)
     found = rims_of(SCENARIO, opened(), ALL, watched)
     assert seen == [[0, 1, 2], [3, 4, 5]]
-    np.testing.assert_allclose(found.rim_height_m, whole.rim_height_m, rtol=0, atol=1e-9)
+    assert_allclose(found.rim_height_m, whole.rim_height_m, rtol=0, atol=1e-9)
     rims_of(SCENARIO, opened(), ALL, watched)
     assert len(seen) == 2

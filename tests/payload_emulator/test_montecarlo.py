@@ -4,12 +4,11 @@ from dataclasses import replace
 from functools import partial
 
 import numpy as np
-import pytest
 from numpy import cos, cross, degrees, exp, radians
 from numpy.linalg import norm
 from numpy.random import default_rng
 from numpy.testing import assert_allclose, assert_array_equal
-from pytest import approx, fixture, mark
+from pytest import approx, fixture, mark, param
 from scipy.special import chdtri
 
 from lunar.constants import MOON_RADIUS_M
@@ -108,7 +107,7 @@ def test_an_attitude_of_a_degree_neither_diverges_nor_lies(case_of):
     assert 0.9 <= result.nis_per_degree <= 1.1
 
 
-@mark.parametrize("seed", [1, *(pytest.param(one, marks=mark.campaign) for one in (2, 3))])
+@mark.parametrize("seed", [1, *(param(one, marks=mark.campaign) for one in (2, 3))])
 def test_an_unannounced_jump_of_five_kilometres_is_noticed_and_mended(case_of, seed):
     run = fly(case_of(80, kidnap=Kidnap(50, 5_000.0, announced=False)), seed)
     assert run.error_m[49] < 300.0

@@ -7,6 +7,7 @@ from dataclasses import replace
 from json import loads
 
 import numpy as np
+from numpy.testing import assert_allclose
 from pytest import approx, fixture, mark, raises
 
 from ground_service.ground import open_ground
@@ -365,7 +366,7 @@ def test_a_pass_that_is_given_back_shows_the_payload_the_same(flown, tmp_path, c
     assert [item["ticks"] for item in again] == [item["ticks"] for item in first]
     for one, other in zip(first, again, strict=True):
         # An AEM has ten digits and more; a pointing error of half a degree would show at once.
-        np.testing.assert_allclose(other["attitude"][:4], one["attitude"][:4], atol=1e-9)
+        assert_allclose(other["attitude"][:4], one["attitude"][:4], atol=1e-9)
     assert 'world = "photographs"' in (out / "mission.toml").read_text()
     # Nothing outside the archive is needed to fly it again.
     assert replay_archive(out, FlightBuild(), tmp_path / "replayed")["frames"] == 3

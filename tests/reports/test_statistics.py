@@ -1,7 +1,7 @@
 """Small statistics of the reports against numbers from outside."""
 
 import numpy as np
-import pytest
+from pytest import approx, mark
 
 from reports.figures.canvas import TimeScale, thinned
 from reports.figures.navigation import zoom_span
@@ -23,13 +23,13 @@ from reports.statistics import (
 from reports.values import NavigationSeries, NavigationStatistics, TimeSpan, TrackSeries
 
 
-@pytest.mark.parametrize("dof", [1, 2, 3, 12, 60, 400])
-@pytest.mark.parametrize("probability", [0.025, 0.5, 0.975])
+@mark.parametrize("dof", [1, 2, 3, 12, 60, 400])
+@mark.parametrize("probability", [0.025, 0.5, 0.975])
 def test_chi_squared_quantiles_are_those_of_scipy(dof, probability):
     from scipy import stats
 
     expected = float(stats.chi2.ppf(probability, dof))
-    assert float(chi2_quantile(probability, dof)) == pytest.approx(expected, rel=1e-9)
+    assert float(chi2_quantile(probability, dof)) == approx(expected, rel=1e-9)
 
 
 def test_quantiles_pass_over_nan_and_say_nan_where_there_is_nothing():
@@ -42,9 +42,9 @@ def test_the_reference_between_samples_lies_on_the_great_circle_across_the_zero_
         np.array([0, 10_000_000_000]), np.zeros(2), np.array([359.8, 0.2]), np.array([30_000.0, 31_000.0])
     )
     latitude, longitude, altitude = reference_at(track, np.array([5_000_000_000, 11_000_000_000]))
-    assert latitude[0] == pytest.approx(0.0, abs=1e-12)
-    assert (longitude[0] + 180.0) % 360.0 - 180.0 == pytest.approx(0.0, abs=1e-9)
-    assert altitude[0] == pytest.approx(30_500.0)
+    assert latitude[0] == approx(0.0, abs=1e-12)
+    assert (longitude[0] + 180.0) % 360.0 - 180.0 == approx(0.0, abs=1e-9)
+    assert altitude[0] == approx(30_500.0)
     assert np.isnan(latitude[1]) and np.isnan(altitude[1])
 
 
@@ -55,8 +55,8 @@ def test_ground_error_is_metres_north_and_east_and_given_statistics_are_kept():
         "x", "estimate", np.array([0]), np.array([61.0]), np.array([0.5]), np.array([3e4]), np.zeros((1, 3))
     )
     north, east = north_east_error_m(one, track)
-    assert north[0] == pytest.approx(30_323.4, abs=1.0)
-    assert east[0] == pytest.approx(15_161.7, abs=1.0)
+    assert north[0] == approx(30_323.4, abs=1.0)
+    assert east[0] == approx(15_161.7, abs=1.0)
     error = np.zeros((5, 3))
     error[:, 1] = [1.0, 2.0, 3.0, 4.0, np.nan]
     one = NavigationSeries(
@@ -98,7 +98,7 @@ def test_short_lines_are_not_thinned_shares_end_at_one_and_bins_of_few_samples_a
     assert found.median[0] == 2.5 and found.count.tolist() == [6]
 
 
-@pytest.mark.parametrize(("low", "high"), [(0.0, 1.0), (14.2, 48.6), (5.0, 5.0), (-3.0, 1e5)])
+@mark.parametrize("low, high", [(0.0, 1.0), (14.2, 48.6), (5.0, 5.0), (-3.0, 1e5)])
 def test_bin_edges_hold_all_values(low, high):
     edges = round_edges(np.array([low, high, np.nan]))
     assert edges[0] <= low and edges[-1] > high
@@ -146,6 +146,6 @@ def test_a_zoom_shows_the_reset_nearest_the_middle_and_what_led_to_it():
 def test_a_mean_per_degree_is_the_ratio_of_sums_and_not_the_mean_of_ratios():
     values, degrees = np.array([6.0, 8.0, np.nan, 5.0]), np.array([2, 16, 2, 0])
     count, mean, within = per_degree(values, degrees)
-    assert (count, mean) == (2, pytest.approx(14.0 / 18.0))  # the mean of 6 / 2 and 8 / 16 is 1.75
+    assert (count, mean) == (2, approx(14.0 / 18.0))  # the mean of 6 / 2 and 8 / 16 is 1.75
     assert within == 1.0  # of 2 degrees 0.05 to 7.4, of 16 degrees 6.9 to 28.8
     assert per_degree(values[2:], degrees[2:])[0] == 0

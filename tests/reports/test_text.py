@@ -7,7 +7,8 @@ import re
 from dataclasses import replace
 
 import numpy as np
-import pytest
+from numpy.testing import assert_allclose
+from pytest import approx, fixture, mark
 
 from reports.document import evidence_label, evidence_number, evidence_text
 from reports.figures import consistency, navigation
@@ -69,8 +70,8 @@ def test_shares_of_nothing_are_no_number_and_times_and_durations_fit_their_size(
     assert texts(duration_text, 42.0, 2_220.0, 86_400.0, 864_000.0) == "42 s; 37.0 min; 24.0 h; 10.0 d"
 
 
-@pytest.mark.parametrize(
-    ("level", "number"),
+@mark.parametrize(
+    "level, number",
     [
         ("3", 3), ("level 2", 2), ("(4) another renderer", 4), ("3s (real terrain seen in training)", 3),
         ("real terrain", None), ("flown over 3 craters", None), ("31", None), ("", None),
@@ -95,8 +96,8 @@ def test_what_is_next_to_nothing_is_said_so_and_a_rate_of_zero_has_no_power_of_t
     assert texts(rate_text, None, 0.0, 2.5e-5) == f"{NOT_A_VALUE}; 0; 2.5e-05"
 
 
-@pytest.mark.parametrize(
-    ("name", "unit", "title"),
+@mark.parametrize(
+    "name, unit, title",
     [
         ("bus_voltage_v", "V", "bus voltage, V"), ("temperature_c", "°C", "temperature, °C"),
         ("storage_used_permille", "‰", "storage used, ‰"), ("vitamin_c", "", "vitamin c"), ("v", "V", "v, V"),
@@ -117,7 +118,7 @@ def test_all_fields_are_there_with_whole_nanoseconds_and_nine_digits_in_the_same
     assert body["reference"]["utc_ns"][0] == int(whole_pass.navigation[0].utc_ns[0])
     assert isinstance(body["reference"]["utc_ns"][0], int)
     back = np.array(json.loads(to_json(whole_pass))["reference"]["latitude_deg"])
-    np.testing.assert_allclose(back, whole_pass.reference.latitude_deg, rtol=5.1e-9, atol=0)
+    assert_allclose(back, whole_pass.reference.latitude_deg, rtol=5.1e-9, atol=0)
 
 
 def test_a_fraction_has_at_most_nine_digits_and_whole_or_very_small_numbers_stay():
@@ -170,7 +171,7 @@ def drawn(draw, height_in=3.6):
     return figure
 
 
-@pytest.mark.parametrize("sigma_m", [0.5, 8.0, 40.0, 4_000.0])
+@mark.parametrize("sigma_m", [0.5, 8.0, 40.0, 4_000.0])
 def test_the_edges_of_three_sigma_are_inside_the_axis(sigma_m):
     rng = np.random.default_rng(1)
     one = series(error_rtn_m=20.0 * rng.standard_normal((N, 3)), sigma_rtn_m=np.full((N, 3), sigma_m))
@@ -183,7 +184,7 @@ def test_the_edges_of_three_sigma_are_inside_the_axis(sigma_m):
         heights = sorted(float(np.mean(np.asarray(line.get_ydata(), dtype=float))) for line in edges)
         assert len(heights) == 2
         factor = 1000.0 if 3 * sigma_m * 1.15 >= 1500 else 1.0
-        assert heights == pytest.approx([-3 * sigma_m / factor, 3 * sigma_m / factor])
+        assert heights == approx([-3 * sigma_m / factor, 3 * sigma_m / factor])
         assert low < heights[0] and heights[1] < high
 
 
@@ -234,17 +235,17 @@ def _report(kind):
     return getattr(example, f"{kind}_report")()
 
 
-@pytest.fixture(scope="module", params=KINDS)
+@fixture(scope="module", params=KINDS)
 def kind(request):
     return str(request.param)
 
 
-@pytest.fixture(scope="module")
+@fixture(scope="module")
 def text(kind):
     return render_html(_report(kind))
 
 
-@pytest.mark.parametrize("kind", ("pass", *KINDS), indirect=True)
+@mark.parametrize("kind", ("pass", *KINDS), indirect=True)
 def test_the_page_is_whole_self_contained_and_repeatable(kind, text):
     page = Page(text)
     assert page.left_open == []
@@ -268,7 +269,7 @@ def test_the_pdf_repeats_and_the_json_names_its_kind(kind):
     assert json.loads(to_json(report))["kind"] == type(report).__name__
 
 
-@pytest.mark.parametrize(
+@mark.parametrize(
     "empty",
     [
         RegressionReport("Empty", "r0"),
@@ -303,8 +304,8 @@ def test_bias_of_octants_both_scores_and_predicted_uncertainty_are_in_tables():
         assert figure in table
 
 
-@pytest.mark.parametrize(
-    ("level", "role"),
+@mark.parametrize(
+    "level, role",
     [("met", "green"), ("not met", "vermillion"), ("unknown", "orange"), ("fail", "vermillion"), ("", "")],
 )
 def test_a_verdict_is_named_by_its_level_and_has_its_colour(level, role):

@@ -1,5 +1,5 @@
 import numpy as np
-import pytest
+from pytest import mark
 
 from tmtc.link.cadu import ASM, cadu_octets, synchronise
 from tmtc.link.link_check import survey_markers
@@ -43,8 +43,8 @@ def test_every_cadu_of_a_stream_is_found_wherever_it_begins_and_none_in_noise():
     assert (find_period(noise), starts(noise)) == (0, [])
 
 
-@pytest.mark.parametrize("which", [slice(10, 11), slice(1, None, 2)])
-@pytest.mark.parametrize("wrong_bits", [1, 3, 4, 16, 24])
+@mark.parametrize("which", [slice(10, 11), slice(1, None, 2)])
+@mark.parametrize("wrong_bits", [1, 3, 4, 16, 24])
 def test_damaged_markers_are_passed_over_while_in_lock_and_turn_no_frame(wrong_bits, which):
     stream = stream_of(20)
     markers = stream.reshape(-1, PERIOD)[which, :4]
@@ -80,7 +80,7 @@ def sync_of_bits(bits, **options):
     return octets, synchronise(octets, PERIOD, **options)
 
 
-@pytest.mark.parametrize("slip", range(1, 8))
+@mark.parametrize("slip", range(1, 8))
 def test_a_stream_that_begins_within_an_octet_is_found_and_aligned(slip):
     stream = stream_of(12)
     octets, sync = sync_of_bits(np.unpackbits(stream)[slip:])
@@ -143,9 +143,9 @@ def header_with_a_likeness(wrong_bits, *, inverted):
     return np.packbits(bits)
 
 
-@pytest.mark.parametrize("inverted", [False, True])
-@pytest.mark.parametrize("count", [1, 2, 12])
-@pytest.mark.parametrize("is_checked", [False, True])
+@mark.parametrize("inverted", [False, True])
+@mark.parametrize("count", [1, 2, 12])
+@mark.parametrize("is_checked", [False, True])
 def test_likenesses_of_a_marker_in_the_headers_of_records_do_not_catch_the_lock(count, inverted, is_checked):
     header = header_with_a_likeness(3, inverted=inverted)
     stream = np.hstack((np.tile(header, (count, 1)), stream_of(count).reshape(-1, PERIOD))).reshape(-1)

@@ -10,9 +10,9 @@ import sys
 from dataclasses import replace
 
 import numpy as np
-import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from pytest import mark, raises
 from spacepackets.ccsds import CdsShortTimestamp, PacketId, PacketType
 from spacepackets.ccsds.spacepacket import parse_space_packets
 
@@ -80,7 +80,7 @@ def test_without_settings_nothing_is_taken_for_a_packet():
     assert decode(octets).packets == 0
 
 
-@pytest.mark.parametrize("seed", range(4))
+@mark.parametrize("seed", range(4))
 def test_packets_of_all_kinds_with_and_without_secondary_header_are_read(seed):
     packets = capture(300, seed)
     assert packets_of(b"".join(packets)) == packets
@@ -108,8 +108,8 @@ def test_ccsdspy_reads_the_same_columns():
 # times of secondary headers
 
 
-@pytest.mark.parametrize("coarse", range(1, 8))
-@pytest.mark.parametrize("fine", [0, 1, 2, 3, 5])
+@mark.parametrize("coarse", range(1, 8))
+@mark.parametrize("fine", [0, 1, 2, 3, 5])
 def test_cuc_times_of_every_width_are_read_through_a_definition(coarse, fine):
     rng = np.random.default_rng(coarse * 10 + fine)
     parameters = {"COARSE": "C", **({"FINE": "F"} if fine else {}), "N": "U8"}
@@ -148,7 +148,7 @@ def test_octets_between_packets_cost_the_packet_before_which_nothing_confirms():
     assert cut(octets).crc_errors == 5
 
 
-@pytest.mark.parametrize("seed", range(5))
+@mark.parametrize("seed", range(5))
 def test_a_hole_costs_the_packets_it_touches(seed):
     rng = np.random.default_rng(seed)
     packets = capture(300, seed)
@@ -183,13 +183,13 @@ def test_a_wrong_length_a_missing_beginning_and_end_cost_no_more_than_their_pack
     assert packets_of(packets[0]) == packets[:1]
 
 
-@pytest.mark.parametrize("seed", range(200))
+@mark.parametrize("seed", range(200))
 def test_noise_is_no_packet(seed):
     noise = np.random.default_rng(seed).integers(0, 256, 20_000, dtype=np.uint8).tobytes()
     assert len(cut(noise)) == 0
 
 
-@pytest.mark.parametrize("error_control", [False, True])
+@mark.parametrize("error_control", [False, True])
 def test_packets_behind_octets_of_a_recorder_are_found_and_damage_costs_no_other(error_control):
     form, rng = PacketForm(error_control), np.random.default_rng(3)
     packets = capture(200, 4)
@@ -235,7 +235,7 @@ def test_idle_packets_are_distinguished_and_pieces_are_refused_without_error_con
     packets = [space_packet(9, bytes((k,)), k) for k in range(10)]
     found = cut(b"".join(p + idle_packet(20) for p in packets))
     assert len(found) == 10 and found.octets_idle == 200
-    with pytest.raises(ValueRefused, match="final"):
+    with raises(ValueRefused, match="final"):
         cut_packets(b"abc", form=UNCHECKED, final=False)
 
 
@@ -309,7 +309,7 @@ def test_json_and_csv_hold_the_records_in_order_with_names_and_times_and_no_pack
     assert json.loads(rows[1]["items"]) == records[1]["items"]
     assert json.loads(format_records([], "json")) == []
     assert format_records([], "csv") == b"\n"
-    with pytest.raises(UnknownPacket, match="expected one of json, csv, parquet, found 'xml'"):
+    with raises(UnknownPacket, match="expected one of json, csv, parquet, found 'xml'"):
         format_records([], "xml")
 
 
@@ -329,7 +329,7 @@ def test_parquet_columns_keep_values_and_gaps_truths_as_integers_and_stay_withou
 
 def test_parquet_without_its_library_says_what_to_install(monkeypatch):
     monkeypatch.setitem(sys.modules, "pyarrow", None)
-    with pytest.raises(MissingLibrary, match=r"expected the library pyarrow, found none; install linna\[parquet\]"):
+    with raises(MissingLibrary, match=r"expected the library pyarrow, found none; install linna\[parquet\]"):
         parquet_octets({"n": [1]})
 
 
@@ -390,7 +390,7 @@ def check_stream(stream, expected, **options):
     return decoded
 
 
-@pytest.mark.parametrize("weak", [20, 100, 180])
+@mark.parametrize("weak", [20, 100, 180])
 def test_weak_frames_at_the_start_hide_neither_the_settings_nor_the_rest(weak):
     rows = cadus().copy()
     rows[:weak] = with_bit_errors(rows[:weak], 1.5e-2, seed=weak)
@@ -401,14 +401,14 @@ def test_weak_frames_at_the_start_hide_neither_the_settings_nor_the_rest(weak):
     assert decoded.frame_count == len(rows) and decoded.frames_bad > weak * 0.8
 
 
-@pytest.mark.parametrize("octets", [77_000, 79_000, 3_000_000])
+@mark.parametrize("octets", [77_000, 79_000, 3_000_000])
 def test_noise_before_the_first_frame_hides_nothing(octets):
     noise = np.random.default_rng(octets).integers(0, 256, octets, dtype=np.uint8)
     decoded = check_stream(np.concatenate((noise, cadus().reshape(-1))), sent())
     assert decoded.octets["unsynchronised"] == octets
 
 
-@pytest.mark.parametrize("rate", [0.0, 2e-3])
+@mark.parametrize("rate", [0.0, 2e-3])
 def test_a_station_header_before_each_frame_is_distinguished_from_the_frame(rate):
     header = np.random.default_rng(8).integers(0, 256, (len(cadus()), 8), dtype=np.uint8)
     decoded = check_stream(np.hstack((header, with_bit_errors(cadus(), rate, seed=9))), sent())
@@ -424,10 +424,10 @@ def test_gaps_of_any_length_between_frames_cost_nothing():
     check_stream(np.concatenate(parts), sent())
 
 
-@pytest.mark.parametrize("rate, seed", [(2e-2, 0), (3e-2, 1)])
+@mark.parametrize("rate, seed", [(2e-2, 0), (3e-2, 1)])
 def test_frames_that_no_code_can_repair_are_never_good(rate, seed):
     rows = with_bit_errors(cadus()[:60], rate, seed)
-    with pytest.raises(LinkFormatError, match="no valid frame"):
+    with raises(LinkFormatError, match="no valid frame"):
         decode(rows.tobytes())
     known = decode(rows.tobytes(), settings=SETTINGS)
     assert not (known.frames.verdict == FRAME_GOOD).any()
@@ -441,7 +441,7 @@ def test_a_frame_without_code_and_checksum_is_unchecked_and_never_good():
     assert decoded.accounting()["frames_unchecked"] == decoded.frame_count
 
 
-@pytest.mark.parametrize("seed", range(20))
+@mark.parametrize("seed", range(20))
 def test_noise_is_never_a_frame_or_a_packet(seed):
     noise = np.random.default_rng(seed).integers(0, 256, 20_000, dtype=np.uint8).tobytes()
     found = decode(noise)

@@ -1,6 +1,7 @@
 import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from numpy.testing import assert_array_equal
 from pytest import mark
 
 from tmtc.packets.sequence import CONFLICT, DUPLICATE, FIRST, account
@@ -129,4 +130,4 @@ def test_any_losses_copies_and_orders_are_accounted_for(start, steps, copies, ra
     assert result.missing == int(sent[-1] - sent[0] + 1 - sent.size)
     assert result.gaps == int(np.count_nonzero(np.diff(sent) > 1))
     assert result.duplicates == len(copies) and result.conflicts == 0
-    np.testing.assert_array_equal(result.extended_count - result.extended_count.min(), counts - counts.min())
+    assert_array_equal(result.extended_count - result.extended_count.min(), counts - counts.min())

@@ -240,7 +240,7 @@ def test_ground_without_a_product_is_registered_from_its_rims(tmp_path):
 
 
 @mark.parametrize(
-    ("changes_list", "message"),
+    "changes_list, message",
     [
         (True, r"registration.json: expected a catalogue with SHA-256 .*make it again"),
         (False, r"flat_128ppd_000E_\+15.tif with SHA-256 .* found another file"),
@@ -373,7 +373,7 @@ def test_files_are_named_in_the_data_folder(tmp_path):
 
 
 @mark.parametrize(
-    ("section", "words"),
+    "section, words",
     [
         ('source = "photograph"', "terrain.photographs must be files where terrain.source is 'photograph'"),
         ('source = "raster"\nphotographs = ["a.tif"]', "terrain.photographs must be files where"),

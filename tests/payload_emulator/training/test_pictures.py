@@ -3,7 +3,8 @@
 import json
 
 import numpy as np
-import pytest
+from numpy.testing import assert_array_equal
+from pytest import approx, fixture, mark, raises
 
 from payload_emulator.errors import DatasetError
 from payload_emulator.flight.models import load_shipped_model
@@ -52,16 +53,16 @@ def test_a_polygon_counts_by_its_area(tmp_path):
     # A square of 20 px and, apart from it, one of 10 px: four fifths of the area pull the centre.
     second = [60, 20, 70, 20, 70, 30, 60, 30]
     (picture,) = load_pictures(write_set(tmp_path, annotations=label(segmentation=[SQUARE, second])))
-    assert picture.u_px[0] == pytest.approx(0.8 * 20 + 0.2 * 65 - 0.5)
-    assert picture.v_px[0] == pytest.approx(0.8 * 30 + 0.2 * 25 - 0.5)
-    assert picture.diameter_px[0] == pytest.approx(np.sqrt(4 * 500 / np.pi))
+    assert picture.u_px[0] == approx(0.8 * 20 + 0.2 * 65 - 0.5)
+    assert picture.v_px[0] == approx(0.8 * 30 + 0.2 * 25 - 0.5)
+    assert picture.diameter_px[0] == approx(np.sqrt(4 * 500 / np.pi))
     assert picture.box_px[0].tolist() == [10, 20, 60, 20]
 
 
 def test_a_polygon_in_the_other_sense_is_the_same(tmp_path):
     back = [value for k in range(3, -1, -1) for value in SQUARE[2 * k : 2 * k + 2]]
     (picture,) = load_pictures(write_set(tmp_path, annotations=label(segmentation=[back])))
-    assert (picture.u_px[0], picture.v_px[0]) == pytest.approx((19.5, 29.5))
+    assert (picture.u_px[0], picture.v_px[0]) == approx((19.5, 29.5))
 
 
 def test_what_an_image_states_of_sun_and_scale_is_read(tmp_path):
@@ -101,10 +102,10 @@ images [{"id": 1, "file_name": "a.png", "pixel_m": 0}] -> images[0].pixel_m: exp
 """
 
 
-@pytest.mark.parametrize(("change", "words"), [line.split(" -> ") for line in BROKEN.strip().splitlines()])
+@mark.parametrize("change, words", [line.split(" -> ") for line in BROKEN.strip().splitlines()])
 def test_a_broken_set_is_refused_by_place(tmp_path, change, words):
     part, _, items = change.partition(" ")
-    with pytest.raises(DatasetError) as refusal:
+    with raises(DatasetError) as refusal:
         load_pictures(write_set(tmp_path, **{part: json.loads(items)}))
     assert words in str(refusal.value) and str(tmp_path) in str(refusal.value)
     assert "\n" not in str(refusal.value)
@@ -134,7 +135,7 @@ def test_labels_of_other_categories_are_no_craters_and_are_counted(tmp_path):
     assert picture.box_px.tolist() == [BOXES[0]] and picture.left_out == ("boulder",) * 3
     (picture,) = load_pictures(tmp_path, category="Boulder")
     assert picture.box_px.tolist() == BOXES[1:] and picture.left_out == ("crater",)
-    with pytest.raises(DatasetError, match="expected the category 'rim', found crater, boulder"):
+    with raises(DatasetError, match="expected the category 'rim', found crater, boulder"):
         load_pictures(tmp_path, category="rim")
 
 
@@ -144,7 +145,7 @@ def test_a_supercategory_says_crater_too_and_a_set_without_craters_is_refused(tm
 
     (picture,) = load_pictures(write_labels(tmp_path / "a", change=renamed))
     assert len(picture.u_px) == 4
-    with pytest.raises(DatasetError, match="expected a category that says crater, or --category, found boulder"):
+    with raises(DatasetError, match="expected a category that says crater, or --category, found boulder"):
         load_pictures(write_labels(tmp_path / "b", change=lambda d: d["categories"].pop(0)))
 
 
@@ -155,8 +156,8 @@ def test_a_label_that_is_listed_twice_counts_once(tmp_path):
     assert picture.box_px.tolist() == BOXES and picture.repeated == 3
 
 
-@pytest.mark.parametrize(
-    ("change", "message"),
+@mark.parametrize(
+    "change, message",
     [
         (lambda d: [a.update(bbox=[*a["bbox"][:2], *np.add(a["bbox"][:2], a["bbox"][2:]).tolist()])
                     for a in d["annotations"]], r"2 of 4 beyond its edge, such as \[40.*: \[x1, y1, x2, y2\]\?"),
@@ -179,14 +180,14 @@ def test_a_label_that_is_listed_twice_counts_once(tmp_path):
 )  # fmt: skip
 def test_a_set_with_another_order_scale_or_identity_is_refused(tmp_path, change, message):
     assert len(load_pictures(write_labels(tmp_path))[0].u_px) == 4
-    with pytest.raises(DatasetError, match=message):
+    with raises(DatasetError, match=message):
         load_pictures(write_labels(tmp_path, change=change))
 
 
 TURNED = "012 345, 210 543, 543 210, 345 012, 03 14 25, 30 41 52, 52 41 30, 25 14 03"
 
 
-@pytest.mark.parametrize(("orientation", "seen"), [*enumerate(TURNED.split(", "), 1)])
+@mark.parametrize("orientation, seen", [*enumerate(TURNED.split(", "), 1)])
 def test_a_picture_is_turned_as_its_exif_data_state(tmp_path, orientation, seen):
     from PIL import Image
 
@@ -198,8 +199,8 @@ def test_a_picture_is_turned_as_its_exif_data_state(tmp_path, orientation, seen)
     assert " ".join("".join(map(str, row)) for row in rows) == seen
 
 
-@pytest.mark.parametrize(
-    ("kind", "bad", "count", "remark"),
+@mark.parametrize(
+    "kind, bad, count, remark",
     [
         ("float32", np.nan, 1, "without data (black)"), ("float32", np.nan, 128, "without data (black)"),
         ("int32", -32768, 128, "without data (black)"), ("float32", -3.4e38, 1, "without data (black)"),
@@ -226,10 +227,10 @@ def test_one_bad_pixel_costs_that_pixel(tmp_path, kind, bad, count, remark):
     write()
     found, words = read_picture(tmp_path / "a.tif")
     assert words == f"{count} {remark} of 4096 pixels"
-    np.testing.assert_array_equal(found[2:], whole[2:])
+    assert_array_equal(found[2:], whole[2:])
 
 
-@pytest.mark.parametrize(("kind", "value"), [("uint8", 255), ("uint16", 65_535), ("float32", -1.0)])
+@mark.parametrize("kind, value", [("uint8", 255), ("uint16", 65_535), ("float32", -1.0)])
 def test_pixels_of_the_value_that_a_tiff_file_states_are_black(tmp_path, kind, value):
     from PIL import Image
 
@@ -240,7 +241,7 @@ def test_pixels_of_the_value_that_a_tiff_file_states_are_black(tmp_path, kind, v
     Image.fromarray(pixels).save(tmp_path / "a.tif", tiffinfo={42113: f"{value}"})
     found, words = read_picture(tmp_path / "a.tif")
     assert words == "4 without data (black) of 16 pixels" and not found[0].any()
-    np.testing.assert_array_equal(found[1:], whole[1:])
+    assert_array_equal(found[1:], whole[1:])
 
 
 def test_values_below_zero_are_black(tmp_path):
@@ -268,7 +269,7 @@ def test_what_is_no_set_is_refused(tmp_path):
         ("none", "no such folder"),
         ("text", "x.json: expected JSON"),
     ):
-        with pytest.raises(DatasetError, match=words):
+        with raises(DatasetError, match=words):
             load_pictures(tmp_path / name)
 
 
@@ -279,12 +280,12 @@ def test_arrays_are_read_as_images(tmp_path):
     assert read_picture(tmp_path / "b.npy")[0].tolist() == [[0, 200]]
 
 
-@pytest.mark.parametrize(
+@mark.parametrize(
     "values", [np.array([1.0]), np.array([["x"]]), np.array([[-1]]), np.zeros((9, 2, 7)), np.array([[None]])]
 )
 def test_arrays_that_are_no_images_are_refused(tmp_path, values):
     np.save(tmp_path / "a.npy", values, allow_pickle=True)
-    with pytest.raises(DatasetError, match="expected an image"):
+    with raises(DatasetError, match="expected an image"):
         read_picture(tmp_path / "a.npy")
 
 
@@ -313,8 +314,8 @@ BOX = [10, 20, 20, 20]  # centre 19.5, 29.5
 HIT, FALSE = (1, 0, 1), (0, 1, 1)
 
 
-@pytest.mark.parametrize(
-    ("u", "size", "score", "strict", "centre"),
+@mark.parametrize(
+    "u, size, score, strict, centre",
     [
         (19.5, 20, 0.9, HIT, HIT),
         # Nine pixels off: squares overlap by 11 of 29 columns (.38), the centre is within 10 px.
@@ -371,7 +372,7 @@ def write_bowls(folder, azimuths, *, stated):
     (folder / "labels.json").write_text(json.dumps(document))
 
 
-@pytest.fixture(scope="module")
+@fixture(scope="module")
 def detector():
     return open_for_evaluation(load_shipped_model())
 
@@ -408,9 +409,9 @@ def test_the_altitude_gives_the_scale(tmp_path, detector):
     write_bowls(tmp_path, [0.0], stated=True)
     found = evaluate_pictures(detector, tmp_path, 0.44, PictureSetOptions(altitude_km=30.0))
     # The focal length is 256 / tan 60 degrees = 147.8 px.
-    assert found["pixel_m"] == [pytest.approx(30_000.0 / 147.80, rel=1e-4)]
+    assert found["pixel_m"] == [approx(30_000.0 / 147.80, rel=1e-4)]
 
 
 def test_a_set_without_craters_is_refused(tmp_path, detector):
-    with pytest.raises(DatasetError, match="expected craters, found 1 images without any"):
+    with raises(DatasetError, match="expected craters, found 1 images without any"):
         evaluate_pictures(detector, write_set(tmp_path, annotations=[]), 0.44)
