@@ -192,9 +192,14 @@ class Connection:
             ) from None
 
     def _download(self, verb: str, path: str, target: Path, **request: Any) -> None:
-        """Write a response to a file in blocks."""
-        with whole_file(target) as partial:
+        """Write a response to a file in blocks; the file is complete or absent."""
+        partial = target.with_name(f".{target.name}.{uuid.uuid4().hex}.partial")
+        target.parent.mkdir(parents=True, exist_ok=True)
+        try:
             self._send(verb, path, sink=partial, **request)
+            partial.replace(target)
+        finally:
+            partial.unlink(missing_ok=True)
 
     def _send(
         self,
@@ -356,18 +361,6 @@ def import_lazily(namespace: dict[str, Any], modules: str) -> None:
 def new_key() -> str:
     """Return a new idempotency key, so that a request can be repeated after a broken connection."""
     return uuid.uuid4().hex
-
-
-@contextmanager
-def whole_file(target: Path) -> Iterator[Path]:
-    """Yield the file to write, which then is the target: that is complete or absent."""
-    partial = target.with_name(f".{target.name}.{uuid.uuid4().hex}.partial")
-    target.parent.mkdir(parents=True, exist_ok=True)
-    try:
-        yield partial
-        partial.replace(target)
-    finally:
-        partial.unlink(missing_ok=True)
 
 
 @contextmanager

@@ -4,7 +4,7 @@ import asyncio
 import sys
 import threading
 import weakref
-from collections.abc import AsyncIterator, Iterator
+from collections.abc import AsyncIterator, Callable, Iterator
 from contextlib import ExitStack
 
 import httpx
@@ -61,6 +61,36 @@ class OperationsOnDemand:
         return any(route.matches(scope)[0] is Match.FULL for route in self._app.state.operations)
 
 
+class LocalDispatcher(Dispatcher):
+    """Dispatcher that finishes every job before its request returns."""
+
+    def start(self, job_id: str) -> None:
+        from ground_service.worker.jobs import run_job
+
+        run_job(self._ground, job_id)
+
+    def resume(self) -> None:
+        """Leave unfinished jobs of other processes to the server."""
+
+    def close(self) -> None:
+        """No job runs between requests."""
+
+
+class FollowUpOnDemand:
+    """In-process follow-up work of events; its code is imported on the first event."""
+
+    def __init__(self, ground: Ground) -> None:
+        self._ground = ground
+        self._follow_up: Callable[[frozenset[str]], None] | None = None
+
+    def __call__(self, kinds: frozenset[str]) -> None:
+        if self._follow_up is None:
+            from ground_service.worker.follow_up import FollowUp
+
+            self._follow_up = FollowUp(self._ground, None)
+        self._follow_up(kinds)
+
+
 class LocalTransport(httpx.BaseTransport):
     """HTTPX transport to an in-process application, with streamed request bodies and response bodies in memory.
 
@@ -68,8 +98,10 @@ class LocalTransport(httpx.BaseTransport):
     it is closed then.
     """
 
-    def __init__(self, ground: Ground, actor: str, dispatcher: Dispatcher) -> None:
+    def __init__(self, ground: Ground, actor: str, *, background: bool = False) -> None:
         self._ground = ground
+        dispatcher = _background_dispatcher(ground) if background else LocalDispatcher(ground)
+        ground.database.listeners.add(FollowUpOnDemand(ground))
         self._asgi = httpx.ASGITransport(local_app(ground, actor, dispatcher))
         self._loop = asyncio.new_event_loop()
         thread = threading.Thread(target=self._loop.run_forever, name="in-process service", daemon=True)
@@ -96,6 +128,12 @@ class LocalTransport(httpx.BaseTransport):
         response = await self._asgi.handle_async_request(passed)
         octets = await response.aread()
         return httpx.Response(response.status_code, headers=response.headers, stream=httpx.ByteStream(octets))
+
+
+def _background_dispatcher(ground: Ground) -> Dispatcher:
+    from ground_service.worker.dispatch import ThreadDispatcher
+
+    return ThreadDispatcher(ground)
 
 
 class _Blocks(httpx.AsyncByteStream):

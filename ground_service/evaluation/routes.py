@@ -10,8 +10,7 @@ from ground_service.evaluation.model import PassFigures, Report, ReportOverview,
 from ground_service.http.common import API_PREFIX, GroundOf, IdempotencyKey, Key, PagingOf, PassId, linked
 from ground_service.http.model import PageOf
 from ground_service.http.requests import operations
-from ground_service.jobs.routes import DispatcherOf
-from ground_service.jobs.service import Job, get_job
+from ground_service.jobs.service import DispatcherOf, Job, get_job
 from ground_service.passes.service import get_pass
 
 REPORT_MEDIA = {"html": "text/html", "pdf": "application/pdf", "json": "application/json"}

@@ -11,7 +11,7 @@ from ground_service.http.requests import operations, problems
 from ground_service.ingest import doubt_store, service, store
 from ground_service.ingest.model import Ingest, IngestAccepted, Withdrawal
 from ground_service.ingest.service import PiecePosition, enter_ingest
-from ground_service.jobs.routes import DispatcherOf
+from ground_service.jobs.service import DispatcherOf
 from ground_service.store.vehicles import FLOWN
 
 UPLOAD_PATHS = (f"{API_PREFIX}/telemetry",)

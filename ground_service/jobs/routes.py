@@ -1,26 +1,15 @@
 """HTTP operations on jobs."""
 
-from typing import Annotated
-
-from fastapi import Depends, Request, Response
+from fastapi import Response
 
 from ground_service.access.security import Operator, Viewer, add_list
 from ground_service.access.service import audit
 from ground_service.http.common import GroundOf, Key
 from ground_service.http.requests import operations, problems
 from ground_service.jobs import service
-from ground_service.jobs.service import Dispatcher, Job
+from ground_service.jobs.service import DispatcherOf, Job
 
 jobs = operations("jobs")
-
-
-async def dispatcher_of(request: Request) -> Dispatcher:
-    """Return the dispatcher of the application."""
-    dispatcher: Dispatcher = request.app.state.dispatcher
-    return dispatcher
-
-
-DispatcherOf = Annotated[Dispatcher, Depends(dispatcher_of)]
 
 
 add_list(jobs, "/jobs", service.list_jobs)

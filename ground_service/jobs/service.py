@@ -8,8 +8,9 @@ import hashlib
 import uuid
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
-from typing import Any
+from typing import Annotated, Any
 
+from fastapi import Depends, Request
 from pydantic import Field
 from sqlalchemy import Connection, and_, delete, or_, select
 
@@ -329,3 +330,12 @@ class Dispatcher(ABC):
     @abstractmethod
     def close(self) -> None:
         """End running jobs: interruptible jobs continue at the next start, others finish."""
+
+
+async def dispatcher_of(request: Request) -> Dispatcher:
+    """Return the dispatcher of the application."""
+    dispatcher: Dispatcher = request.app.state.dispatcher
+    return dispatcher
+
+
+DispatcherOf = Annotated[Dispatcher, Depends(dispatcher_of)]

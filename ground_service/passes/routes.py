@@ -22,8 +22,7 @@ from ground_service.http.common import (
 )
 from ground_service.http.model import PageOf, RequestTime, ns_of
 from ground_service.http.requests import operations, problems
-from ground_service.jobs.routes import DispatcherOf
-from ground_service.jobs.service import Job, get_job
+from ground_service.jobs.service import DispatcherOf, Job, get_job
 from ground_service.passes import archive_import, model, parameters, service, store
 from ground_service.passes import live as newest
 from ground_service.passes.series import STATE_VALUES, series_document

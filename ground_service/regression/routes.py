@@ -11,8 +11,7 @@ from ground_service.errors import Forbidden
 from ground_service.ground import Ground
 from ground_service.http.common import API_PREFIX, GroundOf, IdempotencyKey, Key, PassId, upload_body
 from ground_service.http.requests import operations, problems
-from ground_service.jobs.routes import DispatcherOf
-from ground_service.jobs.service import Job, enter_jobs, get_job
+from ground_service.jobs.service import DispatcherOf, Job, enter_jobs, get_job
 from ground_service.regression import archives as archive_service
 from ground_service.regression import service, store
 from ground_service.regression.builds import CURRENT, load_build, register_build

@@ -150,7 +150,7 @@ def _attempt(ground: Ground, job_id: str) -> Job:
     log.info("job %s (%s) begins", job_id, job.kind, extra={"job": job_id, "kind": job.kind})
     try:
         return _finish(ground, job_id, attempt, result=WORK[job.kind](ground, job.arguments, job_id))
-    except (*PASSING, KeyboardInterrupt) as error:
+    except PASSING as error:
         log.info("job %s (%s) will run again: %s", job_id, job.kind, error)
         _put_back(ground, job_id, attempt)
         raise

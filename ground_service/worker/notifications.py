@@ -19,6 +19,8 @@ from email.message import EmailMessage
 from pathlib import Path
 from typing import Any
 
+import httpx
+
 from ground_service.errors import GroundError, InvalidInput, storage_error
 from ground_service.missions.automation import Channel
 
@@ -70,8 +72,6 @@ def post(url: str, body: bytes, headers: Mapping[str, str], networks: Sequence[N
     Unreachable
         If there is no answer in time.
     """
-    import httpx
-
     try:
         place = httpx.URL(url)
     except httpx.InvalidURL as error:

@@ -16,7 +16,7 @@ from pytest import fixture, mark, raises
 from ground_service.app import create_app
 from ground_service.client import Client, ServiceProblem, connection
 from ground_service.client.connection import ATTEMPTS, BUSY_S, JobFailed, Unreachable
-from ground_service.client.local import LocalDispatcher, local_client
+from ground_service.client.local import local_client
 from ground_service.client.transport import LocalTransport
 from ground_service.ground import open_ground
 from ground_service.settings import Settings
@@ -386,8 +386,7 @@ def test_the_example_of_the_documentation_runs(tmp_path, capsys, monkeypatch):
         """Client that ignores the address of the example."""
 
         def __init__(self, _server, token=None):
-            ground = open_ground(tmp_path / "home")
-            transport = LocalTransport(ground, "ann", LocalDispatcher(ground))
+            transport = LocalTransport(open_ground(tmp_path / "home"), "ann")
             super().__init__("http://localhost", token, transport=transport)
 
     monkeypatch.setattr("ground_service.client.Client", OnThisMachine)

@@ -10,9 +10,6 @@ import numpy as np
 from numpy.testing import assert_allclose
 from pytest import fixture, mark, raises
 
-from ground_service.client.connection import NotFound as NotFoundThere
-from ground_service.client.connection import ServiceProblem
-from ground_service.client.local import local_client
 from ground_service.errors import EvaluationError, InvalidInput, NotFound, StorageFull
 from ground_service.evaluation import service as reports
 from ground_service.evaluation.inputs import load_pass_inputs, orientation_of
@@ -298,27 +295,6 @@ def test_a_pdf_is_made_of_stored_octets_when_it_is_first_read(imported, tmp_path
     assert digests == {kept()}
     monkeypatch.setattr(pdf_pages, "pdf_of", fail)
     assert report_document(ground, key, "pdf")[:5] == b"%PDF-"
-
-
-def test_a_report_is_made_in_process_without_http(imported, tmp_path, monkeypatch):
-    """An operation states the fault of a request that fails in process."""
-    ground, pass_id, _ = imported
-    monkeypatch.setattr(pdf_pages, "pdf_of", lambda *_: b"%PDF-")
-    with local_client(open_ground(ground.home), "ann") as client, monkeypatch.context() as patched:
-        patched.setattr(type(client), "_transport", None)
-        key = client.make_report(pass_id)
-        for kind in "html", "json", "pdf":
-            client.get_report(key, tmp_path / f"report.{kind}", format=kind)
-        assert client.get_report_summary(key).pass_id == pass_id
-        assert client.get_job(key).state == "done"
-        patched.undo()
-        for ask in client.make_report, client.get_job, client.get_report_summary:
-            with raises(ServiceProblem, match=r"expected|String should match"):
-                ask(-1)
-        with raises(NotFoundThere, match=f"report {'0' * 32}: not found"):
-            client.get_report("0" * 32, tmp_path / "none")
-    assert sorted(file.name for file in tmp_path.iterdir()) == ["report.html", "report.json", "report.pdf"]
-    assert (tmp_path / "report.pdf").read_bytes() == report_document(ground, key, "pdf") == b"%PDF-"
 
 
 @mark.parametrize(
