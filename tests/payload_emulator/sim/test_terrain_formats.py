@@ -169,7 +169,7 @@ def test_decoded_pixels_stay_within_their_limit_after_a_week_of_passes():
     for number in range(newest + 1):
         chunks.put((0, 0, number, 0), chunk)
     held = [number for number in range(newest + 1) if chunks.get((0, 0, number, 0)) is not None]
-    assert held == list(range(newest - 7, newest + 1))
+    assert held == list(range(newest - 5, newest + 1))
     assert chunks.octets == CHUNK_LIMIT_OCTETS == len(held) << 22
 
 
