@@ -3,13 +3,11 @@
 from collections.abc import Hashable, Mapping
 from typing import Any
 
-import numpy as np
 from sqlalchemy import Connection, ScalarSelect, bindparam, func, insert, select
 
 from ground_service.http.model import PageOf
 from ground_service.passes.model import PassDetail, PassFilter, PassRecord, PassSummary
 from ground_service.store import repository
-from lunar.arrays import IntArray
 
 _PASSES = repository.PASSES
 _FRAMES = repository.PASS_FRAMES
@@ -86,12 +84,12 @@ def passes_of_vehicle(connection: Connection, vehicle: int) -> list[PassRecord]:
     return [PassRecord.of(row) for row in connection.execute(query).mappings()]
 
 
-def reported_times(connection: Connection, vehicle: int) -> IntArray:
-    """Return id, start and stop, (n, 3), of the passes of a vehicle that have a report, oldest first."""
+def reported_times(connection: Connection, vehicle: int) -> list[tuple[int, int, int]]:
+    """Return id, start and stop of the passes of a vehicle that have a report, oldest first."""
     columns = _PASSES.c.id, _PASSES.c.start_utc_ns, _PASSES.c.stop_utc_ns
     known = _PASSES.c.id.in_(select(repository.REPORTS.c.pass_id))
     rows = connection.execute(select(*columns).where(_PASSES.c.vehicle_id == vehicle, known).order_by(_PASSES.c.id))
-    return np.array(rows.all(), dtype=np.int64).reshape(-1, 3)
+    return [(key, start, stop) for key, start, stop in rows]
 
 
 def previous_pass(connection: Connection, record: PassRecord, spacecraft_id: int) -> PassRecord | None:

@@ -14,6 +14,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
 
+import numpy as np
 from sqlalchemy import Connection
 
 from ground_service.errors import PASSING, NotFound, fault_of
@@ -351,8 +352,7 @@ def follow_in_process(ground: Ground, start: Start | None = None) -> FollowUp:
 
 def _reported_passes(connection: Connection, vehicle: int, first_ticks: int, last_ticks: int) -> list[int]:
     """Return the passes of a vehicle that have a report and that contain on-board times of an interval."""
-
-    keys, start_ns, stop_ns = reported_times(connection, vehicle).T
+    keys, start_ns, stop_ns = np.array(reported_times(connection, vehicle), dtype=np.int64).reshape(-1, 3).T
     correlations = load_correlations(connection, vehicle)
     start_ticks = ticks_of_times(start_ns - REACH_NS, correlations)
     stop_ticks = ticks_of_times(stop_ns + REACH_NS, correlations)
