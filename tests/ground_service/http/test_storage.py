@@ -19,18 +19,15 @@ from tests.ground_service.conftest import wait_for
 V1 = "/api/v1"
 
 
-def full(*_, **__):
-    raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-
-
-def read_only(*_, **__):
-    raise OSError(errno.EROFS, os.strerror(errno.EROFS))
-
-
-@mark.parametrize("failing, status, words", [(full, 507, "no space left"), (read_only, 503, "cannot be written")])
+@mark.parametrize(
+    "code, status, words", [(errno.ENOSPC, 507, "no space left"), (errno.EROFS, 503, "cannot be written")]
+)
 def test_an_upload_that_cannot_be_kept_is_refused_and_readiness_tells(
-    client, synthetic_pass, monkeypatch, failing, status, words
+    client, synthetic_pass, monkeypatch, code, status, words
 ):
+    def failing(*_, **__):
+        raise OSError(code, os.strerror(code))
+
     stream = (synthetic_pass.folder / "downlink.cadu").read_bytes()
     assert client.get("/readyz").status_code == 200
     with monkeypatch.context() as disk:

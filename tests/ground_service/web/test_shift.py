@@ -161,7 +161,7 @@ def shift(tmp_path, make_pass, console, serve):
     with open_ground(home) as ground:
         add_user(ground, "root", "admin")
         token = add_user(ground, "ann", "operator")
-        import_archive(ground, make_pass(mission=GOLDEN).folder)
+        import_archive(ground, make_pass(mission=GOLDEN.replace("selenita", "archive")).folder)
         add_mission(ground, MISSION.format(**ports).encode(), actor="root")
         stored = ground.files.put_file(tmp_path / "coming.oem")
         add_ephemeris(ground, stored, name="coming.oem", precedence=0, actor="root")
