@@ -118,7 +118,7 @@ def memory_by_day(folder, days):
                         kib = re.search(r"VmRSS:\s+(\d+)", Path(f"/proc/{pid}/status").read_text())[1]
                         found.setdefault(pid, {}).setdefault(int(day[1]), []).append(int(kib) >> 10)
     assert run.returncode == 0
-    return [one for one in found.values() if max(one[days - 1]) > 100]
+    return [one for one in found.values() if len(one) >= days and max(one[days - 1]) > 100]
 
 
 @mark.campaign
