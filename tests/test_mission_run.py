@@ -98,25 +98,14 @@ def assert_same_figures(one, other):
 def memory_by_day(folder, days):
     """Return the resident memory in MiB of ground and spacecraft after each contact of a run, by day and process."""
     found = {}
-    command = [
-        sys.executable,
-        "-m",
-        "linna",
-        "mission",
-        "run",
-        "selenita",
-        "--days",
-        str(days),
-        "--folder",
-        str(folder),
-    ]
+    command = [sys.executable, *f"-m linna mission run selenita --days {days} --folder {folder}".split()]
     with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as run:
         for line in run.stderr:
             if day := re.search(r": day +(\d+)\.", line):
                 for pid in (run.pid, *descendants(run.pid)):
-                    with suppress(FileNotFoundError, AttributeError):
-                        kib = re.search(r"VmRSS:\s+(\d+)", Path(f"/proc/{pid}/status").read_text())[1]
-                        found.setdefault(pid, {}).setdefault(int(day[1]), []).append(int(kib) >> 10)
+                    with suppress(FileNotFoundError):
+                        pages = Path(f"/proc/{pid}/statm").read_text().split()[1]
+                        found.setdefault(pid, {}).setdefault(int(day[1]), []).append(int(pages) >> 8)
     assert run.returncode == 0
     return [one for one in found.values() if len(one) >= days and max(one[days - 1]) > 100]
 
@@ -127,7 +116,6 @@ def test_the_memory_of_a_simulated_week_ends_within_a_twentieth_of_that_of_its_s
     assert len(processes) == 2
     for days in processes:
         assert np.median(days[6]) < 1.05 * np.median(days[1])
-        assert max(map(max, days.values())) <= 450
 
 
 @mark.campaign

@@ -28,30 +28,30 @@ SETTLED, SAMPLES = 24, 12
 
 async def _watched(base: str, part: Part, viewers: int, minutes: float) -> tuple[list[int], Counter[str]]:
     """Return the resident memory while viewers watch, and what went wrong."""
-    wrong: Counter[str] = Counter()
+    wrong = Counter[str]()
 
-    async def feed() -> None:
+    async def feed():
         async with connect(f"{base.replace('http', 'ws', 1)}/live?values=true") as socket:
             async for _ in socket:
                 pass
 
-    async def read(first: int) -> None:
+    async def read(first):
         for path in itertools.islice(itertools.cycle(READS), first, None):
             status = (await client.get(path)).status_code
             if status != 200:
                 wrong[f"{status} {path}"] += 1
             await asyncio.sleep(PAUSE_S)
 
-    async def receive() -> None:
+    async def receive():
         for number in itertools.count(1):
             piece = mixed_downlink(PIECE, START + number * PIECE // 4 * STEP_NS)
             (await client.post("/telemetry?spacecraft_id=76", content=piece)).raise_for_status()
             await asyncio.sleep(PIECE_S)
 
-    samples: list[int] = []
-    async with httpx.AsyncClient(base_url=base, timeout=60.0, limits=httpx.Limits(max_connections=None)) as client:
-        work = [receive(), *(one for k in range(viewers) for one in (feed(), read(k)))]
-        tasks = [asyncio.create_task(one) for one in work]
+    samples = []
+    async with httpx.AsyncClient(base_url=base, timeout=60.0) as client:
+        work = [receive(), *map(read, range(viewers)), *(feed() for _ in range(viewers))]
+        tasks = list(map(asyncio.create_task, work))
         while len(samples) < 60.0 * minutes / SAMPLE_S and not wrong:
             ended, _ = await asyncio.wait(tasks, timeout=SAMPLE_S, return_when=asyncio.FIRST_COMPLETED)
             wrong.update(str(one.exception() or "a feed ended") for one in ended)
@@ -62,7 +62,7 @@ async def _watched(base: str, part: Part, viewers: int, minutes: float) -> tuple
     return samples, wrong
 
 
-def growth(samples: list[int]) -> float:
+def growth(samples):
     """Return the median of the last minute over that of the minute in which the viewers have settled."""
     return statistics.median(samples[-SAMPLES:]) / statistics.median(samples[SETTLED - SAMPLES : SETTLED])
 

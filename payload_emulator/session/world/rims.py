@@ -10,6 +10,7 @@ from kernels import keep, kept
 from lunar.arrays import IntArray
 from lunar.catalogue import CraterCatalogue
 from lunar.datafolder import DataFolder
+from lunar.plausible import HEIGHT_M
 from payload_emulator.session.scenario import Scenario
 from payload_emulator.sim.terrain.tiles import Terrain, ground_hash
 
@@ -56,4 +57,6 @@ def rims_of(scenario: Scenario, terrain: Terrain, craters: IntArray, watched: Wa
     found = terrain.measured(useful)
     if octets is None and terrain.sources:
         keep(name, terrain.measurements_m(useful).tobytes(), KEPT)
-    return found
+    # The ground of the procedural Moon is in places beyond all of the Moon's: such a rim counts as unknown.
+    height_m = found.rim_height_m
+    return replace(found, rim_height_m=np.where(HEIGHT_M.holds(height_m), height_m, np.nan))
