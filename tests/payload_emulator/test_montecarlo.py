@@ -197,7 +197,7 @@ def test_craters_that_the_payload_mapped_are_met_again_and_their_errors_known(mo
     result = consistency([run], settle_frames=444)
     assert result.own_share > 0.3 and run.findable.mean() < 4.0  # of twelve craters that are detected
     # A map believed twenty times too much is found out by the errors.
-    assert (result.anees <= chdtri(6, 0.025)) == (believed == 1.0)
+    assert (result.anees <= chdtri(6, 0.05)) == (believed == 1.0)
 
 
 def test_a_regional_shift_has_its_size_and_is_alike_over_its_angle():
