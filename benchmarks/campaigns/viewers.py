@@ -19,14 +19,13 @@ from websockets.asyncio.client import connect
 from benchmarks._ground_service import READS, resident_mib, wait_for_job
 from benchmarks._servers import Deployment
 from benchmarks.ground import START, STEP_NS, definition, mixed_downlink
-from studies.harness.parts import Part
 
 PACKETS, PIECE, PIECE_S, PAUSE_S, SAMPLE_S = 20_000, 400, 5.0, 2.0, 5.0
 SETTLED, SAMPLES = 24, 12
 """Samples until viewers have settled, two minutes, and those of a minute, whose medians are compared."""
 
 
-async def _watched(base: str, part: Part, viewers: int, minutes: float) -> tuple[list[int], Counter[str]]:
+async def _watched(base, part, viewers, minutes):
     """Return the resident memory while viewers watch, and what went wrong."""
     wrong = Counter[str]()
 
@@ -50,8 +49,8 @@ async def _watched(base: str, part: Part, viewers: int, minutes: float) -> tuple
 
     samples = []
     async with httpx.AsyncClient(base_url=base, timeout=60.0) as client:
-        work = [receive(), *map(read, range(viewers)), *(feed() for _ in range(viewers))]
-        tasks = list(map(asyncio.create_task, work))
+        work = receive(), *map(read, range(viewers)), *(feed() for _ in range(viewers))
+        tasks = [*map(asyncio.create_task, work)]
         while len(samples) < 60.0 * minutes / SAMPLE_S and not wrong:
             ended, _ = await asyncio.wait(tasks, timeout=SAMPLE_S, return_when=asyncio.FIRST_COMPLETED)
             wrong.update(str(one.exception() or "a feed ended") for one in ended)
@@ -67,7 +66,7 @@ def growth(samples):
     return statistics.median(samples[-SAMPLES:]) / statistics.median(samples[SETTLED - SAMPLES : SETTLED])
 
 
-def main(viewers: str = "50", minutes: str = "10") -> int:
+def main(viewers="50", minutes="10"):
     """Run the campaign; 1 if something went wrong or memory grew."""
     with tempfile.TemporaryDirectory() as name, Deployment(Path(name), LINNA_SOCKETS_PER_USER=viewers) as service:
         base, part = f"{service.apis[0]}/api/v1", service.parts["api 1"]

@@ -10,7 +10,7 @@ from kernels import keep, kept
 from lunar.arrays import IntArray
 from lunar.catalogue import CraterCatalogue
 from lunar.datafolder import DataFolder
-from lunar.plausible import HEIGHT_M
+from lunar.plausible import CRATER_DEPTH, HEIGHT_M
 from payload_emulator.session.scenario import Scenario
 from payload_emulator.sim.terrain.tiles import Terrain, ground_hash
 
@@ -58,5 +58,7 @@ def rims_of(scenario: Scenario, terrain: Terrain, craters: IntArray, watched: Wa
     if octets is None and terrain.sources:
         keep(name, terrain.measurements_m(useful).tobytes(), KEPT)
     # The ground of the procedural Moon is in places beyond all of the Moon's: such a rim counts as unknown.
-    height_m = found.rim_height_m
-    return replace(found, rim_height_m=np.where(HEIGHT_M.holds(height_m), height_m, np.nan))
+    height_m, depth_m = found.rim_height_m, found.depth_m
+    beyond = ~(HEIGHT_M.holds(height_m) & CRATER_DEPTH.holds(np.nan_to_num(depth_m / found.diameter_m)))
+    height_m[beyond] = depth_m[beyond] = np.nan
+    return found
