@@ -148,14 +148,20 @@ def forget_others(connection: Connection, vehicle: int, definition: int | None) 
         )
 
 
+FEW_PACKETS = 20_000
+"""Packets of all vehicles after a position, below which they are read by their ids."""
+
+
 def packets_after(
     connection: Connection, vehicle: int, packet_id: int, apids: Collection[int], limit: int
 ) -> StoredPackets:
     """Return the next packets of these APIDs, in the order of their ids."""
-    mine = _PACKETS.c.vehicle_id + 0 == vehicle  # by their ids: the index of vehicles would give all packets so far
+    newest = connection.execute(select(func.max(_PACKETS.c.id))).scalar() or 0
+    # The index of vehicles gives all packets of one so far, the ids those of all vehicles since. A sum uses no index.
+    key = _PACKETS.c.vehicle_id + 0 if newest - packet_id < FEW_PACKETS else _PACKETS.c.vehicle_id
     query = (
         select(_PACKETS.c.id, _PACKETS.c.apid, _PACKETS.c.octets)
-        .where(mine, _PACKETS.c.id > packet_id, _PACKETS.c.apid.in_(sorted(apids)))
+        .where(key == vehicle, _PACKETS.c.id > packet_id, _PACKETS.c.apid.in_(sorted(apids)))
         .order_by(_PACKETS.c.id)
         .limit(limit)
     )
