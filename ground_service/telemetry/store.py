@@ -15,18 +15,14 @@ from lunar.arrays import IntArray
 from tmtc.dictionary.payload import DICTIONARY
 
 
-def packet_headers(
-    connection: Connection, vehicle: int, start_ticks: int | None = None, stop_ticks: int | None = None
-) -> dict[str, IntArray]:
-    """APID, on-board time and sequence count of the stored packets of a vehicle, by APID and time."""
+def packet_headers(connection: Connection, vehicle: int, start_ticks: int, stop_ticks: int) -> dict[str, IntArray]:
+    """APID, on-board time and sequence count of the stored packets of a vehicle between two times, by APID and time."""
     # With its APIDs stated, the index is read only between the times.
     query = select(PACKETS.c.apid, PACKETS.c.ticks, PACKETS.c.sequence_count).where(
-        PACKETS.c.vehicle_id == vehicle, PACKETS.c.apid.in_(_apids(connection, vehicle))
+        PACKETS.c.vehicle_id == vehicle,
+        PACKETS.c.apid.in_(_apids(connection, vehicle)),
+        PACKETS.c.ticks.between(start_ticks, stop_ticks),
     )
-    if start_ticks is not None:
-        query = query.where(PACKETS.c.ticks >= start_ticks)
-    if stop_ticks is not None:
-        query = query.where(PACKETS.c.ticks <= stop_ticks)
     query = query.order_by(PACKETS.c.apid, PACKETS.c.ticks, PACKETS.c.sequence_count, PACKETS.c.digest)
     rows = whole_numbers(connection, query)
     return {"apid": rows[:, 0], "ticks": rows[:, 1], "sequence_count": rows[:, 2]}

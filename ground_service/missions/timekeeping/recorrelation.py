@@ -43,7 +43,7 @@ from lunar.arrays import IntArray
 from lunar.constants import SPEED_OF_LIGHT_M_S
 from lunar.ephemeris import Ephemeris as States
 from lunar.errors import LunarError
-from lunar.messages.ephemeris_files import load_ephemeris
+from lunar.messages.ephemeris_files import load_arcs
 from lunar.plausible import CORRELATION_RMS_NS
 from lunar.third_bodies import earth_position_icrf_m
 from lunar.timescales import tai_ns_from_utc_ns, tdb_s_from_utc_ns
@@ -370,7 +370,7 @@ def _light_times_s(path: Path, station: GroundStation | None, earth_utc_ns: tupl
 
 @functools.lru_cache(maxsize=2)
 def _load(path: Path) -> States:
-    return load_ephemeris(path)
+    return load_arcs(path)
 
 
 MANUAL = "least squares of time reports"
