@@ -73,8 +73,7 @@ class KeptDrawings(Drawings):
             self[one.key] = svg
 
     def _drawn(self, one: Picture) -> str:
-        draw = super()._drawn
-        return made_once(f"figure-{drawing_hash(one)}", lambda: draw(one).encode(), KEPT_FIGURES).decode()
+        return made_once(f"figure-{drawing_hash(one)}", lambda: _svg_of(one).encode(), KEPT_FIGURES).decode()
 
 
 class DrawingProcesses:

@@ -78,17 +78,15 @@ class QuickAxes(Axes):
             self.spines[name].register_axis(axis)
 
 
-@lru_cache(maxsize=4096)
-def _extent(text: str, font: FontProperties, math: Any) -> tuple[float, float, float]:
-    width, height, descent = text_to_path.get_text_width_height_descent(text, font, math)
-    return width, height, descent
+_extent = lru_cache(maxsize=4096)(text_to_path.get_text_width_height_descent)
 
 
 class PageRenderer(RendererSVG):  # type: ignore[misc]
     """SVG with paths to a hundredth of a point; a text of one font is measured once for all figures."""
 
     def get_text_width_height_descent(self, s: str, prop: FontProperties, ismath: Any) -> tuple[float, float, float]:
-        return _extent(s, prop, ismath)
+        extent: tuple[float, float, float] = _extent(s, prop, ismath)
+        return extent
 
     def _convert_path(
         self, path: Any, transform: Any = None, clip: Any = None, simplify: Any = None, sketch: Any = None

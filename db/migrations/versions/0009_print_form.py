@@ -3,8 +3,6 @@
 Revision: 1.8, after 1.7
 """
 
-from __future__ import annotations
-
 import sqlalchemy as sa
 from alembic import op
 
