@@ -19,36 +19,37 @@ from websockets.asyncio.client import connect
 from benchmarks._ground_service import READS, resident_mib, wait_for_job
 from benchmarks._servers import Deployment
 from benchmarks.ground import START, STEP_NS, definition, mixed_downlink
+from studies.harness.parts import Part
 
 PACKETS, PIECE, PIECE_S, PAUSE_S, SAMPLE_S = 20_000, 400, 5.0, 2.0, 5.0
 SETTLED, SAMPLES = 24, 12
 """Samples until viewers have settled, two minutes, and those of a minute, whose medians are compared."""
 
 
-async def _watched(base, part, viewers, minutes):
+async def _watched(base: str, part: Part, viewers: int, minutes: float) -> tuple[list[int], Counter[str]]:
     """Return the resident memory while viewers watch, and what went wrong."""
     wrong = Counter[str]()
 
-    async def feed():
+    async def feed() -> None:
         async with connect(f"{base.replace('http', 'ws', 1)}/live?values=true") as socket:
             async for _ in socket:
                 pass
 
-    async def read(first):
+    async def read(first: int) -> None:
         for path in itertools.islice(itertools.cycle(READS), first, None):
             status = (await client.get(path)).status_code
             if status != 200:
                 wrong[f"{status} {path}"] += 1
             await asyncio.sleep(PAUSE_S)
 
-    async def receive():
+    async def receive() -> None:
         for number in itertools.count(1):
             piece = mixed_downlink(PIECE, START + number * PIECE // 4 * STEP_NS)
             (await client.post("/telemetry?spacecraft_id=76", content=piece)).raise_for_status()
             await asyncio.sleep(PIECE_S)
 
-    samples = []
-    async with httpx.AsyncClient(base_url=base, timeout=60.0) as client:
+    samples: list[int] = []
+    async with httpx.AsyncClient(base_url=base, timeout=60.0, limits=httpx.Limits(max_connections=None)) as client:
         work = receive(), *map(read, range(viewers)), *(feed() for _ in range(viewers))
         tasks = [*map(asyncio.create_task, work)]
         while len(samples) < 60.0 * minutes / SAMPLE_S and not wrong:
@@ -61,12 +62,12 @@ async def _watched(base, part, viewers, minutes):
     return samples, wrong
 
 
-def growth(samples):
+def growth(samples: list[int]) -> float:
     """Return the median of the last minute over that of the minute in which the viewers have settled."""
     return statistics.median(samples[-SAMPLES:]) / statistics.median(samples[SETTLED - SAMPLES : SETTLED])
 
 
-def main(viewers="50", minutes="10"):
+def main(viewers: str = "50", minutes: str = "10") -> int:
     """Run the campaign; 1 if something went wrong or memory grew."""
     with tempfile.TemporaryDirectory() as name, Deployment(Path(name), LINNA_SOCKETS_PER_USER=viewers) as service:
         base, part = f"{service.apis[0]}/api/v1", service.parts["api 1"]

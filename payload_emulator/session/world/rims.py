@@ -59,6 +59,5 @@ def rims_of(scenario: Scenario, terrain: Terrain, craters: IntArray, watched: Wa
         keep(name, terrain.measurements_m(useful).tobytes(), KEPT)
     # The ground of the procedural Moon is in places beyond all of the Moon's: such a rim counts as unknown.
     height_m, depth_m = found.rim_height_m, found.depth_m
-    beyond = ~(HEIGHT_M.holds(height_m) & CRATER_DEPTH.holds(np.nan_to_num(depth_m / found.diameter_m)))
-    height_m[beyond] = depth_m[beyond] = np.nan
-    return found
+    known = HEIGHT_M.holds(height_m) & CRATER_DEPTH.holds(np.nan_to_num(depth_m / found.diameter_m))
+    return replace(found, rim_height_m=np.where(known, height_m, np.nan), depth_m=np.where(known, depth_m, np.nan))
