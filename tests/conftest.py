@@ -48,7 +48,7 @@ HEAVY = ("torch", "astropy", "scipy.stats", "matplotlib", "onnxscript", "playwri
 IMPORTED = pytest.StashKey[list[str]]()
 
 
-PASSED = Path(__file__).parents[1] / "build" / "campaigns.txt"
+PASSED = Path(__file__).parents[1] / "build/campaigns.txt"
 
 
 def pytest_addoption(parser):

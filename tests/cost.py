@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 
 TABLE = Path(__file__).with_name("cost.csv")
-MEASURED = Path(__file__).parents[1] / "build" / "test-cost.csv"
+MEASURED = Path(__file__).parents[1] / "build/test-cost.csv"
 MARGIN = 1.2
 SMALLEST_TURNS = 20  # folders below this are noise
 

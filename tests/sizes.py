@@ -13,7 +13,7 @@ import tokenize
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent
-TABLE = ROOT / "tests" / "sizes.csv"
+TABLE = ROOT / "tests/sizes.csv"
 PACKAGES = (
     "ground_service", "payload_emulator", "tmtc", "lunar", "kernels", "reports", "linna", "studies",
     "benchmarks", "db", "deploy", "tests",

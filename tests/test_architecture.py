@@ -294,7 +294,7 @@ def test_no_function_of_the_product_is_longer_than_eighty_lines():
 
 def test_a_planted_function_of_one_line_more_is_found(tmp_path):
     (tmp_path / "lunar").mkdir()
-    file = tmp_path / "lunar" / "planted.py"
+    file = tmp_path / "lunar/planted.py"
     file.write_text("async def longest():\n" + "    pass\n" * (LONGEST_FUNCTION - 1))
     assert long_functions(tmp_path) == []
     file.write_text("async def longer():\n" + "    pass\n" * LONGEST_FUNCTION)
@@ -337,7 +337,7 @@ def test_a_planted_repetition_of_fields_is_found(tmp_path):
     (tmp_path / "lunar").mkdir()
     shared = "".join(f"    {name}: float\n" for name in "abcd")
     planted = f"class A:\n{shared}    e: int\n    f: int\nclass B:\n{shared}    e: int\n    g: int\nclass C:\n{shared}"
-    (tmp_path / "lunar" / "planted.py").write_text(planted)
+    (tmp_path / "lunar/planted.py").write_text(planted)
     assert repeated_entities(tmp_path) == {("A", "B")}
 
 
@@ -368,7 +368,7 @@ FILES = {
 
 
 def release(*words):
-    command = ["sh", str(ROOT / "deploy" / "release.sh"), *map(str, words)]
+    command = ["sh", str(ROOT / "deploy/release.sh"), *map(str, words)]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     sys.stderr.write(done.stderr)
     return done.returncode
@@ -376,7 +376,7 @@ def release(*words):
 
 def made_key(path):
     """Make a key pair with the documented commands."""
-    page = (ROOT / "docs" / "deployment.md").read_text()
+    page = (ROOT / "docs/deployment.md").read_text()
     for command in re.findall(r"^    (\(umask.*|openssl pkey -in.*)$", page, re.MULTILINE):
         words = command.replace("linna-release.key", str(path)).replace("linna-release.pub", f"{path}.pub")
         subprocess.run(words, shell=True, check=True)
@@ -495,7 +495,7 @@ def test_a_new_folder_may_cost_little():
 
 
 def test_what_was_measured_is_written_and_read_as_turns_by_folder(tmp_path, monkeypatch):
-    written = tmp_path / "build" / "cost.csv"
+    written = tmp_path / "build/cost.csv"
     monkeypatch.setattr(cost, "MEASURED", written)
     monkeypatch.setattr(cost, "turn_s", lambda: 0.5)
     measured, lines = cost.Cost(), []

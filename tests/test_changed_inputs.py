@@ -632,7 +632,7 @@ def keys_of(code):
 
 @mark.parametrize("section", CODE)
 def test_the_table_of_readers_has_the_names_that_the_code_reads_and_no_others(section):
-    page = Path(__file__).parents[1] / "docs" / "reference" / "readers.md"
+    page = Path(__file__).parents[1] / "docs/reference/readers.md"
     body = page.read_text().partition(f"\n## {section}\n")[2].partition("\n## ")[0]
     rows = "\n".join(line for line in body.splitlines() if line.startswith("|"))
     stated = {name.casefold() for name in re.findall(r"`(\w[\w ()]*)`", rows)}

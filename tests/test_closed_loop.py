@@ -61,10 +61,10 @@ def test_the_demo_prints_the_agreed_keys_and_its_score_is_that_of_the_ground_wit
     for mode in ("paper", "spherical", "anchored"):
         assert figures["navigation"][mode].keys() >= {"median_3d_m", "p95_3d_m", "max_3d_m", "drift_percent"}
     assert any("procedural" in source for source in figures["data"])
-    summary = json.loads((out / "pass" / "summary.json").read_text())
+    summary = json.loads((out / "pass/summary.json").read_text())
     assert summary["truth_reads_after_start"] == 0
     assert summary["estimators"]["paper"]["anchor_reads_after_start"] >= FRAMES - 1  # the altitude, each frame
-    score = json.loads((out / "pass" / "summary.json").read_text())["navigation"]["imaging_from_start"]
+    score = json.loads((out / "pass/summary.json").read_text())["navigation"]["imaging_from_start"]
     flown = figures["navigation"]["anchored"]
     # One goes by full states and the truth, the other by reported places and the ephemeris on the ground.
     assert score["median_m"] == approx(flown["median_3d_m"], abs=1.0)
@@ -74,7 +74,7 @@ def test_the_demo_prints_the_agreed_keys_and_its_score_is_that_of_the_ground_wit
 
 def test_the_manifest_hashes_what_lies_in_the_archive(demo):
     _, out = demo
-    manifest = json.loads((out / "pass" / "manifest.json").read_text())
+    manifest = json.loads((out / "pass/manifest.json").read_text())
     assert set(manifest["files"]) >= {"downlink.cadu", "reference.oem", "truth.oem", "catalogue.csv", "summary.json"}
     for name, entry in manifest["files"].items():
         octets = (out / "pass" / name).read_bytes()

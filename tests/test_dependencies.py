@@ -125,7 +125,7 @@ HASHED = ["runtime", "postgres", "parquet", "traces", "oidc", "objects", "terrai
 
 @mark.parametrize("name", HASHED)
 def test_the_requirements_with_hashes_are_the_same_versions(name):
-    text = (ROOT / "requirements" / "hashed" / f"{name}.txt").read_text().replace("\\\n", " ")
+    text = (ROOT / "requirements/hashed" / f"{name}.txt").read_text().replace("\\\n", " ")
     entries = {name_of(line): line for line in text.splitlines() if line and not line.startswith("#")}
     assert {key: Requirement(line.partition("--hash")[0].strip()) for key, line in entries.items()} == pins(name)
     for line in entries.values():

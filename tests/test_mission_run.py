@@ -323,7 +323,7 @@ def test_a_restored_checkpoint_has_archive_spacecraft_and_progress_of_one_moment
         write(number)
         checkpoints.keep(progress)
     write(3)
-    (home / "incoming" / "segment").touch()
+    (home / "incoming/segment").touch()
     assert checkpoints.restore().read_text() == snapshot.read_text() == "2"
     with closing(sqlite3.connect(home / "linna.db")) as connection:
         assert connection.execute("select number from one").fetchall() == [(1,), (2,)]
@@ -344,7 +344,7 @@ def test_a_stopped_run_continues_and_ends_with_the_same_figures(whole, tmp_path,
     folder = tmp_path / "stopped"
     with raises(KeyboardInterrupt):
         run_mission(parse_scenario(SCENARIO), NO_DATA, folder, TERMS, stop)
-    assert (folder / "checkpoint" / "archive.db").exists()
+    assert (folder / "checkpoint/archive.db").exists()
     monkeypatch.setattr("studies.mission_run.run.CHECKPOINT_S", 3600.0)
     again = run_mission(parse_scenario(SCENARIO), NO_DATA, folder, TERMS, lines.append)
     assert any("continues from 2029-08-07T" in line for line in lines)

@@ -52,7 +52,7 @@ def built(tmp_path_factory):
             (source / name).parent.mkdir(parents=True, exist_ok=True)
             shutil.copy(ROOT / name, source / name)
     (site,) = re.findall(r"^site_dir: (.+)$", (ROOT / "mkdocs.yml").read_text(), re.MULTILINE)
-    page = source / site / "tutorials" / "first-pass.html"
+    page = source / site / "tutorials/first-pass.html"
     page.parent.mkdir(parents=True)
     page.write_text("First pass")
     code = f"import setuptools.build_meta as b, sys; b.build_wheel({str(folder)!r}); b.build_sdist({str(folder)!r})"
@@ -181,8 +181,8 @@ def test_the_commands_of_the_tour_run_with_the_installed_wheel(installed, tmp_pa
         server.wait(60)
     for line in tour[2:]:
         in_folder(tmp_path, *command(line))
-    assert (tmp_path / "linna-demo" / "window.cltu").stat().st_size > 0
-    assert (tmp_path / "linna-demo" / "report" / "report.pdf").read_bytes().startswith(b"%PDF")
+    assert (tmp_path / "linna-demo/window.cltu").stat().st_size > 0
+    assert (tmp_path / "linna-demo/report/report.pdf").read_bytes().startswith(b"%PDF")
 
 
 def answers(port):

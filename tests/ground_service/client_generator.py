@@ -21,7 +21,7 @@ from ground_service.http.common import IDEMPOTENCY_HEADER, IF_MATCH_HEADER, OPER
 from ground_service.http.model import PageOf, Paging, UtcTime
 from ground_service.http.requests import header_names
 
-TARGET = Path(__file__).parents[2] / "ground_service" / "client" / "operations.py"
+TARGET = Path(__file__).parents[2] / "ground_service/client/operations.py"
 BY_HAND = {"take_uplink"}
 """Operations whose result is also in headers; `Client` has them."""
 

@@ -32,8 +32,8 @@ from tests.ground_service.conftest import cells
 from tests.serving import TestClient
 
 DEPLOY = Path(__file__).resolve().parents[2] / "deploy"
-RULES = DEPLOY / "prometheus" / "linna.rules.yml"
-DASHBOARD = DEPLOY / "grafana" / "linna.json"
+RULES = DEPLOY / "prometheus/linna.rules.yml"
+DASHBOARD = DEPLOY / "grafana/linna.json"
 NAME = re.compile(r"\blinna_[a-z_]+\b")
 SELECTOR = re.compile(r"\b(linna_[a-z_]+)\{([^}]*)\}")
 S = 1_000_000_000
@@ -60,7 +60,7 @@ def samples(tmp_path_factory, synthetic_pass):
         vehicle = ingest_file(ground, synthetic_pass.folder / "downlink.cadu").vehicle_id
         enter_job(ground, "report", {"pass_id": 1})
         add_correlation(ground, vehicle, utc_now_ns())
-        backup(ground, folder / "backups" / "one", now_utc_ns=utc_now_ns())
+        backup(ground, folder / "backups/one", now_utc_ns=utc_now_ns())
     settings = Settings(home=folder / "home", backups=folder / "backups")
 
     def distributed(*given):
@@ -313,8 +313,8 @@ def test_the_newest_complete_backup_counts(ground, tmp_path):
     assert not read_condition(ground, None).backup_missing
     for name, made in ("a", 3000 * S), ("b", 2000 * S):
         backup(ground, tmp_path / "backups" / name, now_utc_ns=made)
-    (tmp_path / "backups" / "c").mkdir()
-    (tmp_path / "backups" / "c" / "backup.json").write_text('{"made_utc"')
+    (tmp_path / "backups/c").mkdir()
+    (tmp_path / "backups/c/backup.json").write_text('{"made_utc"')
     assert newest_backup_utc_ns(tmp_path / "backups") == 3000 * S
 
 

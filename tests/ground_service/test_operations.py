@@ -166,7 +166,7 @@ def test_links_keep_the_filter_of_a_list(client):
 REFUSALS = re.findall(
     r"^\| (?P<mistake>[^|]+) \| `(?P<request>[A-Z]+ [^` ]+)`(?: `(?P<body>[^`]*)`)?(?: with `(?P<header>[^`]+)`)? "
     r"\| (?P<status>\d{3}) \| (?P<line>.+) \|$",
-    (Path(__file__).parents[2] / "docs" / "results" / "http-mistakes.md").read_text(),
+    (Path(__file__).parents[2] / "docs/results/http-mistakes.md").read_text(),
     re.MULTILINE,
 )
 

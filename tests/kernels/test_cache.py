@@ -133,7 +133,7 @@ def test_the_folder_is_private_and_files_of_others_are_ignored(tmp_path, monkeyp
     assert kept("a-1") == b"code"
     monkeypatch.setattr(os, "getuid", lambda: uid + 1)
     assert kept("a-1") == (b"code" if uid == 0 else None)
-    os.chown(tmp_path / "cache" / "a-1", 12345, -1) if uid == 0 else None
+    os.chown(tmp_path / "cache/a-1", 12345, -1) if uid == 0 else None
     assert kept("a-1") is None
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "of-a-user"))
     monkeypatch.setattr(os, "getuid", lambda: uid or 12345)

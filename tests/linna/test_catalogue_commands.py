@@ -69,7 +69,7 @@ def test_a_list_is_registered_to_terrain(tmp_path, typed):
     listed = make_catalogue(
         np.radians(latitude - 50.0 / METRES_PER_DEG), np.radians(longitude), [10_000.0] * 25, source="one"
     )
-    path, out = tmp_path / "list.csv", tmp_path / "made" / "registration.json"
+    path, out = tmp_path / "list.csv", tmp_path / "made/registration.json"
     save_catalogue(listed, path)
     figures = typed(f"catalogue register {path} --terrain {raster} --out {out} --json")
     assert (figures["rims"], figures["out"]) == (25, str(out))

@@ -156,7 +156,7 @@ def test_commands_accept_names_of_shipped_scenarios():
 
 def test_installation_hints_fit_the_environment(monkeypatch, tmp_path):
     assert install_hint("train") == "make install-dev"  # a checkout
-    monkeypatch.setattr("payload_emulator.errors.__file__", str(tmp_path / "payload_emulator" / "errors.py"))
+    monkeypatch.setattr("payload_emulator.errors.__file__", str(tmp_path / "payload_emulator/errors.py"))
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
     assert install_hint("train") == f"python3 -m pip --python {sys.executable} install 'linna[train]'"
     monkeypatch.setattr("importlib.util.find_spec", lambda name: object())

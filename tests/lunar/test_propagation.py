@@ -187,7 +187,7 @@ def test_the_transition_matrix_is_the_change_of_the_end_with_the_start(duration_
             assert_allclose(matrix[part, column], slope[part], atol=atol)
 
 
-REFERENCE = json.loads((Path(__file__).parents[1] / "references" / "lunar" / "third_bodies_de421.json").read_text())
+REFERENCE = json.loads((Path(__file__).parents[1] / "references/lunar/third_bodies_de421.json").read_text())
 
 
 def tide(gm, body_m, orbiter_m):

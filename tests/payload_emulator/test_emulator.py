@@ -162,7 +162,7 @@ def test_a_named_anchoring_table_is_uploaded_as_it_is(tmp_path):
     named = tmp_path / "three.table"
     named.write_bytes(pack_catalogue_table(table))
     emulate(parse_scenario(SHORT).with_choices(anchoring_catalogue=named), find_data(None), tmp_path / "pass")
-    manifest = json.loads((tmp_path / "pass" / "manifest.json").read_text())
+    manifest = json.loads((tmp_path / "pass/manifest.json").read_text())
     assert manifest["tables"]["catalogue"] == hashlib.sha256(named.read_bytes()).hexdigest()
 
 

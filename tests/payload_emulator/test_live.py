@@ -414,5 +414,5 @@ def test_a_processor_that_hangs_is_reset_and_the_payload_goes_on(flown):
 
 
 def test_every_kind_of_fault_is_documented():
-    page = (Path(__file__).resolve().parents[2] / "docs" / "payload.md").read_text()
+    page = (Path(__file__).resolve().parents[2] / "docs/payload.md").read_text()
     assert all(f"`{kind}`" in page for kind in FAULT_KINDS)

@@ -327,14 +327,14 @@ def flown(tmp_path_factory):
     emulate(parse_scenario(TEXT), DataFolder(), folder / "pass", frames_kept=None)
     given = folder / "given"
     given.mkdir(mode=0o700)
-    rows = [line.split(",") for line in (folder / "pass" / "frame_times.csv").read_text().splitlines()[1:]]
+    rows = [line.split(",") for line in (folder / "pass/frame_times.csv").read_text().splitlines()[1:]]
     table = ["file,utc"]
     for number, utc_ns in rows:
         name = f"{int(number):06d}.png"
-        shutil.copy(folder / "pass" / "frames" / name, given / name)
+        shutil.copy(folder / "pass/frames" / name, given / name)
         table.append(f"{name},{format_utc(int(utc_ns), 9)}")
     (given / "frames.csv").write_text("\n".join(table) + "\n")
-    shutil.copy(folder / "pass" / "truth.oem", given / "orbit.oem")
+    shutil.copy(folder / "pass/truth.oem", given / "orbit.oem")
     times = np.array([int(utc_ns) for _, utc_ns in rows], dtype=np.int64)
     q_wxyz = np.array([item["attitude"][:4] for item in inputs(folder / "pass") if item["frame"] >= 0])
     (given / "attitude.aem").write_text(format_aem((AttitudeSegment(times, q_wxyz),)))
@@ -343,7 +343,7 @@ def flown(tmp_path_factory):
 
 
 def inputs(folder):
-    return [loads(line) for line in (folder / "payload" / "inputs.jsonl").read_text().splitlines()]
+    return [loads(line) for line in (folder / "payload/inputs.jsonl").read_text().splitlines()]
 
 
 def copied(flown, to):
@@ -398,7 +398,7 @@ def test_without_attitudes_the_camera_points_as_the_scenario_says(flown, tmp_pat
     other = next(item for item in inputs(tmp_path / "out") if item["frame"] == 0)["attitude"][:4]
     # The scenario's pointing without its error of half a degree.
     assert 1e-4 < 2.0 * np.arccos(min(1.0, abs(np.dot(one, other)))) < 0.05
-    assert "photographs" not in (tmp_path / "out" / "mission.toml").read_text()
+    assert "photographs" not in (tmp_path / "out/mission.toml").read_text()
 
 
 def test_attitudes_between_two_epochs_lie_on_the_arc_between_them(flown, tmp_path):

@@ -193,7 +193,7 @@ def test_a_picture_is_written_whole_or_not_at_all(tmp_path):
     save_png(np.zeros((8, 8, 3), np.uint16), tmp_path / "a.png")
     assert [file.name for file in tmp_path.iterdir()] == ["a.png"]
     with raises(OSError):
-        save_png(np.zeros((8, 8, 3), np.uint8), tmp_path / "missing" / "a.png")
+        save_png(np.zeros((8, 8, 3), np.uint8), tmp_path / "missing/a.png")
 
 
 # One frame that happens to be close is no recovery.

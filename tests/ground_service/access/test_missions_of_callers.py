@@ -376,8 +376,8 @@ def openmct(tmp_path):
     (folder / "dist").mkdir(parents=True)
     (folder / "package.json").write_text('{"version": "4.2.0"}')
     (folder / "LICENSE.md").write_text("terms")
-    (folder / "dist" / "openmct.js").write_text("script")
-    (folder / "dist" / "secret.env").write_text("no file of the displays")
+    (folder / "dist/openmct.js").write_text("script")
+    (folder / "dist/secret.env").write_text("no file of the displays")
     return folder
 
 

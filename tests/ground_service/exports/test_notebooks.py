@@ -25,7 +25,7 @@ from tests.ground_service.exports.conftest import FRAMES
 from tmtc.errors import MissingLibrary
 
 ROOT = Path(__file__).resolve().parents[3]
-NOTEBOOKS = sorted((ROOT / "docs" / "notebooks").glob("*.ipynb"))
+NOTEBOOKS = sorted((ROOT / "docs/notebooks").glob("*.ipynb"))
 
 
 def check(archive):
@@ -48,7 +48,7 @@ def check(archive):
 def test_the_examples_of_other_tools_run_where_the_tool_is_installed(rich_ground, tmp_path, monkeypatch, capsys):
     monkeypatch.setenv("LINNA_HOME", str(rich_ground.home))
     monkeypatch.chdir(tmp_path)
-    text, names = (ROOT / "docs" / "other-tools.md").read_text(), {"__name__": "example"}
+    text, names = (ROOT / "docs/other-tools.md").read_text(), {"__name__": "example"}
     examples = re.findall(r"<!-- tool: (\w+) -->\n```python\n(.*?)```", text, re.DOTALL)
     for tool, source in examples:
         program = compile(source, tool, "exec")

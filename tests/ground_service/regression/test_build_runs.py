@@ -40,12 +40,12 @@ def fly(make_build, archive, tmp_path):
 def test_a_program_that_ends_well_leaves_a_downlink_and_its_costs(fly, tmp_path):
     run = fly("pathlib.Path(sys.argv[2], 'downlink.packets').write_bytes(b'abc')\nx = [0] * 4_000_000")
     assert (run.outcome, run.detail) == ("ok", "")
-    assert run.downlink == tmp_path / "out" / "downlink.packets"
+    assert run.downlink == tmp_path / "out/downlink.packets"
     assert run.downlink.read_bytes() == b"abc"
     assert 0.0 < run.cpu_s < 10.0
     # Four million pointers of eight octets, on top of an interpreter of some ten.
     assert 30.0 < run.peak_rss_mib < 120.0
-    assert not (tmp_path / "out" / ".run").exists()
+    assert not (tmp_path / "out/.run").exists()
 
 
 def test_builds_do_not_run_without_bubblewrap(fly, monkeypatch):
@@ -183,7 +183,7 @@ def test_a_program_that_damages_its_archive_damages_a_copy(fly, archive):
 
 def test_a_run_goes_into_a_new_folder_only(fly, tmp_path):
     (tmp_path / "out").mkdir()
-    (tmp_path / "out" / "precious").write_text("x")
+    (tmp_path / "out/precious").write_text("x")
     with raises(InvalidInput, match="expected a new or empty folder"):
         fly("")
 
@@ -284,7 +284,7 @@ def test_a_wrong_parameter_is_refused_in_one_line_and_nothing_is_registered(grou
         register_build(ground, load_build(write(text)))
     assert str(error.value) == message
     assert ground.read(list_builds, Paging()).items == []
-    assert not list((ground.home / "regression" / "builds").glob("*"))
+    assert not list((ground.home / "regression/builds").glob("*"))
 
 
 def test_right_parameters_are_registered_and_checked_once(ground, write, monkeypatch):

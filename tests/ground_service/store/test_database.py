@@ -57,7 +57,7 @@ def url(path):
 
 
 def test_a_new_database_is_made_with_the_newest_schema(tmp_path):
-    database = prepare_database(url(tmp_path / "deep" / "folder"))
+    database = prepare_database(url(tmp_path / "deep/folder"))
     found, head, _ = schema_revisions(database)
     assert found == head
     with database.reading() as connection:

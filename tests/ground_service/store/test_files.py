@@ -35,7 +35,7 @@ def test_octets_name_and_folders_are_synchronised_before_the_file_is_stored(tmp_
 
     monkeypatch.setattr(os, "replace", noted_replace)
     monkeypatch.setattr(os, "fsync", noted_fsync)
-    stored = FileArchive(tmp_path / "home" / "files").put_octets(b"telemetry")
+    stored = FileArchive(tmp_path / "home/files").put_octets(b"telemetry")
     assert operations == [".", "home", "octets", "replace", f"home/files/{stored.sha256[:2]}", "home/files"]
 
 
@@ -81,7 +81,7 @@ def test_leftovers_of_ended_processes_are_removed_at_the_start(tmp_path, ended_p
         (files.root / name).write_bytes(b"half")
         folder = tmp_path / name.replace("incoming", "unpacking")
         (folder / "images").mkdir(parents=True)
-        (folder / "images" / "0.png").write_bytes(b"half")
+        (folder / "images/0.png").write_bytes(b"half")
     for old in files.root / ".incoming-old", tmp_path / ".unpacking-old":
         os.utime(old, (0, 0))
     with open_ground(tmp_path):
@@ -92,9 +92,9 @@ def test_leftovers_of_ended_processes_are_removed_at_the_start(tmp_path, ended_p
 
 
 def test_a_folder_is_whole_on_the_disk_before_it_has_its_name(tmp_path, monkeypatch):
-    (tmp_path / "partial" / "files").mkdir(parents=True)
-    (tmp_path / "partial" / "files" / "a").write_bytes(b"a")
-    (tmp_path / "partial" / "list").write_bytes(b"list")
+    (tmp_path / "partial/files").mkdir(parents=True)
+    (tmp_path / "partial/files/a").write_bytes(b"a")
+    (tmp_path / "partial/list").write_bytes(b"list")
     steps = []
     replace, read = os.replace, os.readlink
     monkeypatch.setattr(os, "fsync", lambda fd: steps.append(read(f"/proc/self/fd/{fd}")))
@@ -104,7 +104,7 @@ def test_a_folder_is_whole_on_the_disk_before_it_has_its_name(tmp_path, monkeypa
     before = {partial, f"{partial}/files", f"{partial}/files/a", f"{partial}/list"}
     assert set(steps[:-2]) == before
     assert steps[-2:] == ["name", str(tmp_path)]
-    assert (tmp_path / "backup" / "files" / "a").read_bytes() == b"a"
+    assert (tmp_path / "backup/files/a").read_bytes() == b"a"
 
 
 def test_commits_to_sqlite_are_synchronised(ground):
@@ -113,6 +113,6 @@ def test_commits_to_sqlite_are_synchronised(ground):
 
 
 def test_folders_are_made_once(tmp_path):
-    make_durable_folder(tmp_path / "a" / "b")
-    make_durable_folder(tmp_path / "a" / "b")
-    assert (tmp_path / "a" / "b").is_dir()
+    make_durable_folder(tmp_path / "a/b")
+    make_durable_folder(tmp_path / "a/b")
+    assert (tmp_path / "a/b").is_dir()

@@ -141,5 +141,5 @@ def test_nothing_writes_a_state_but_the_store():
 
 
 _ROOT = Path(ground_service.__file__).parent
-_ELSEWHERE = (_ROOT / "ingest" / "store.py", _ROOT / "links" / "store.py")
+_ELSEWHERE = (_ROOT / "ingest/store.py", _ROOT / "links/store.py")
 """An ingest is done by its job alone; a link is taken by one statement that compares the end of its lease."""

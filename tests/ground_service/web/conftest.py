@@ -29,7 +29,7 @@ from tests.serving import wait_for
 cv2 = Lazy("cv2")
 
 CHROMIUM = "/usr/bin/chromium"
-OPENMCT = Path(__file__).parents[3] / "deploy" / "openmct"
+OPENMCT = Path(__file__).parents[3] / "deploy/openmct"
 TIMEOUT_S = 900.0
 NS = 1_000_000_000
 # Counts the requests of a page's scripts until their answers are read, and notes what was refused.
@@ -220,7 +220,7 @@ def openmct(tmp_path_factory):
         if os.environ.get("CI"):
             raise
         skip(f"Open MCT cannot be installed: {error}")
-    return folder / "node_modules" / "openmct"
+    return folder / "node_modules/openmct"
 
 
 class Pictures:

@@ -163,7 +163,7 @@ def mailbox():
 
 def test_a_webhook_gets_a_signed_document_with_its_id(webhook, tmp_path):
     (tmp_path / "secrets").mkdir()
-    (tmp_path / "secrets" / "hook").write_text("key\n")
+    (tmp_path / "secrets/hook").write_text("key\n")
     channel = Channel(webhook=webhook.url, signing_secret="hook")
     assert send(tmp_path, channel, "id-1", {"event": 3}) == 1
     [(headers, body)] = webhook.received

@@ -206,11 +206,11 @@ def test_a_backup_of_an_object_store_is_restored_into_another(opened, synthetic_
     ground = opened("home")
     pass_id = import_archive(ground, synthetic_pass.folder)
     build = register_build(ground, load_build(make_build("one", {"a": [b"packet"]})))
-    for path in (tmp_path / "home" / "files").rglob("*"):
+    for path in (tmp_path / "home/files").rglob("*"):
         if path.is_file():
             path.unlink()  # the backup reads the store
     backup(ground, tmp_path / "backup", now_utc_ns=10**18)
-    assert not [path for path in (tmp_path / "home" / "files").rglob("*") if path.is_file()]
+    assert not [path for path in (tmp_path / "home/files").rglob("*") if path.is_file()]
     other = opened("other", folder="other")
     restore(tmp_path / "backup", other)
     assert verify(other, rebuild=True).verdict == "intact"

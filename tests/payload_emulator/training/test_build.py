@@ -116,7 +116,7 @@ def test_a_build_killed_at_work_goes_on_to_the_same_bytes(built, tmp_path):
         while first.poll() is None and not list(target.glob("shards/*.npz")):
             time.sleep(0.02)
         first.kill()
-    (target / "images" / ".000002.png.4711").write_bytes(b"half a picture")
+    (target / "images/.000002.png.4711").write_bytes(b"half a picture")
     assert 1 <= len(list(target.glob("shards/*.npz"))) < 4
     list(build(load_recipe(recipe), target, 3, find_data(None)))
     assert check(target) == []
@@ -177,7 +177,7 @@ def test_sixteen_bits_show_what_eight_do(built, tmp_path):
 
 
 def test_metadata_tell_pose_corners_and_sun(built):
-    document = json.loads((built / "metadata" / "000003.json").read_text())
+    document = json.loads((built / "metadata/000003.json").read_text())
     for key in ("latitude_deg", "longitude_deg", "altitude_km", "tilt_deg", "azimuth_deg", "corners_deg"):
         assert key in document
     assert_allclose(np.array(document["camera_from_mcmf"]) @ document["sun_mcmf"], document["sun_camera"], atol=1e-12)
@@ -218,7 +218,7 @@ def test_other_files_in_the_folder_are_left_alone(tmp_path):
 
 
 def test_real_terrain_without_data_is_refused(tmp_path):
-    recipe = load_recipe(ROOT / "scenarios" / "detector-dataset.toml")
+    recipe = load_recipe(ROOT / "scenarios/detector-dataset.toml")
     with raises(DatasetError, match="expected terrain tiles"):
         list(build(recipe, tmp_path / "set", 40, find_data(None)))
 
@@ -243,7 +243,7 @@ def test_labels_of_fresh_craters_sit_on_dark_and_bright_walls(built):
 
 @mark.real_data
 def test_training_frames_keep_sixty_kilometres_from_every_held_out_box(tmp_path, data_path):
-    recipe = load_recipe(ROOT / "scenarios" / "detector-dataset.toml")
+    recipe = load_recipe(ROOT / "scenarios/detector-dataset.toml")
     empty_set(tmp_path)
     shard = plan_shards(recipe, 400)[0]
     shard = dataclasses.replace(shard, frame_numbers=shard.frame_numbers[:2])
@@ -404,7 +404,7 @@ share = 1.0
 
 
 def test_the_shipped_recipe_of_the_papers_data_set_flies_the_shipped_orbit():
-    recipe = load_recipe(ROOT / "scenarios" / "paper-dataset.toml")
+    recipe = load_recipe(ROOT / "scenarios/paper-dataset.toml")
     (along,) = recipe.sources
     assert (along.split, along.light, along.step_s, along.days) == ("80/15/5", "paper", 30.0, 30.0)
     track = laid(dataclasses.replace(along, days=0.1, step_s=60.0), 60, recipe.seed)

@@ -430,7 +430,7 @@ def test_a_plain_scenario_gives_the_procedural_recipe_of_its_seed_and_its_splits
 
 
 def test_the_shipped_recipe_keeps_every_test_and_validation_box_away_from_training():
-    recipe = load_recipe(ROOT / "scenarios" / "detector-dataset.toml")
+    recipe = load_recipe(ROOT / "scenarios/detector-dataset.toml")
     train = [s for s in recipe.sources if s.split == "train" and s.terrain == "real"]
     held = [box for s in recipe.sources if s.split != "train" and s.terrain == "real" for box in s.boxes]
     assert held

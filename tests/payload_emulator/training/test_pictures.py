@@ -73,7 +73,7 @@ def test_what_an_image_states_of_sun_and_scale_is_read(tmp_path):
 
 def test_several_files_at_any_depth_are_one_set(tmp_path):
     write_set(tmp_path / "train")
-    write_set(tmp_path / "deep" / "valid")
+    write_set(tmp_path / "deep/valid")
     (tmp_path / "other.json").write_text("[1]")
     assert len(load_pictures(tmp_path)) == 2
 

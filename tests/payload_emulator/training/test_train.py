@@ -96,7 +96,7 @@ def test_a_network_retrained_with_learned_craters_finds_them_elsewhere_and_no_fe
     train([listed], tmp_path / "old", parameters := replace(SHORT, steps=40))
     recall = []
     for name, learned in (("further", None), ("learned", pits_at(here, listed))):
-        train([listed], tmp_path / name, parameters, start_from=tmp_path / "old" / "checkpoint.pt", landmarks=learned)
+        train([listed], tmp_path / name, parameters, start_from=tmp_path / "old/checkpoint.pt", landmarks=learned)
         network, _ = load_network(tmp_path / name / "checkpoint.pt")
         found = [detect_with_network(network, unseen, one, "cpu") for one in frames]
         recall.append([tally(truth, found).figures(0.1).recall for truth in truths])
@@ -196,14 +196,14 @@ def test_a_run_killed_and_resumed_reaches_the_figures_of_one_left_alone(blob_dat
     process.send_signal(signal.SIGKILL)
     process.wait()
     process.stdout.close()
-    _, stored = load_network(tmp_path / "killed" / "checkpoint.pt")
+    _, stored = load_network(tmp_path / "killed/checkpoint.pt")
     assert 1 <= stored["progress"]["step"] < 5
     resumed = train([blob_dataset], tmp_path / "killed", parameters, report=(lines := []).append)
     assert f"resumed at step {stored['progress']['step']}," in lines[0]
     straight = train([blob_dataset], tmp_path / "straight", parameters)
     assert resumed["steps"] == straight["steps"] == 5
     assert resumed["best"] == straight["best"]
-    one, _ = load_network(tmp_path / "killed" / "checkpoint.pt")
-    other, _ = load_network(tmp_path / "straight" / "checkpoint.pt")
+    one, _ = load_network(tmp_path / "killed/checkpoint.pt")
+    other, _ = load_network(tmp_path / "straight/checkpoint.pt")
     for name, value in one.state_dict().items():
         assert torch.equal(value, other.state_dict()[name]), name

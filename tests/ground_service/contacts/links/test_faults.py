@@ -169,7 +169,7 @@ def test_a_link_that_could_not_be_opened_is_opened_later_with_its_spool_and_its_
     declare(ground, station.link())
     declared = service.declared_links(ground)["lab"]
     assert service.start_contact(ground, declared, mission_now_ns()) is not None
-    folder = ground.home / "incoming" / "link-lab"
+    folder = ground.home / "incoming/link-lab"
     folder.mkdir(parents=True)
     (folder / "000000000000.segment").write_bytes(stream)
     monkeypatch.setattr(store, "open_contact", failing(store.open_contact, {1, 2}))
@@ -220,7 +220,7 @@ def test_the_spool_is_locked_until_the_owner_that_lost_the_lease_has_ingested_it
         go_on.set()
         assert not held_by_second
         wait_for(second._hold_spool, "the lock")
-        assert not list((ground.home / "incoming" / "link-lab").glob("*.segment"))
+        assert not list((ground.home / "incoming/link-lab").glob("*.segment"))
         assert first.octets_received == 3 * CADU
         second._lock.close()
 
@@ -229,7 +229,7 @@ def test_a_link_is_taken_at_once_from_an_owner_that_has_ended_and_not_from_other
     declare(ground, station.link())
     acquired(ground, "killed", lease_ns=70 * NS)
     supervisor = LinkSupervisor(ground)
-    folder = ground.home / "incoming" / "link-lab"
+    folder = ground.home / "incoming/link-lab"
     folder.mkdir(parents=True)
     held = folder / "lock"
 
@@ -255,7 +255,7 @@ def test_a_link_is_taken_at_once_from_an_owner_that_has_ended_and_not_from_other
 
 def test_a_process_that_never_held_the_spool_ingests_nothing_of_it(ground, station, stream):
     declare(ground, station.link())
-    folder = ground.home / "incoming" / "link-lab"
+    folder = ground.home / "incoming/link-lab"
     folder.mkdir(parents=True)
     segment = folder / "000000000000.segment"
     segment.write_bytes(stream)
@@ -338,7 +338,7 @@ def test_a_segment_whose_ingest_is_stopped_is_kept(tmp_path):
 
 def test_a_file_whose_ingest_is_stopped_is_read_again(tmp_path):
     (tmp_path / "in").mkdir()
-    path = tmp_path / "in" / "pass.cadu"
+    path = tmp_path / "in/pass.cadu"
     path.write_bytes(b"octets")
     seen = []
     folder = WatchedFolder(tmp_path / "in", tmp_path / "ledger.json", stopping, lambda _, result: seen.append(result))

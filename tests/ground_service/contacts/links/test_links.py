@@ -170,7 +170,7 @@ def test_each_contact_is_a_recording_unless_it_ends_within_a_frame(ground, stati
 
 def test_what_an_ended_process_has_left_in_its_spool_is_ingested_by_the_next(either, station, stream, expected):
     declare(either, station.link())
-    folder = either.home / "incoming" / "link-lab"
+    folder = either.home / "incoming/link-lab"
     folder.mkdir(parents=True)
     (folder / "000000000003.segment").write_bytes(stream[: 4 * CADU + 9])
     (folder / "current").write_bytes(stream[4 * CADU + 9 :])
@@ -429,11 +429,11 @@ def test_folders_are_watched_and_telecommands_written(ground, tmp_path, stream, 
 def test_the_file_is_not_read_again_by_the_next_process(ground, tmp_path, stream):
     declare(ground, f'[[links]]\nname = "lab"\nkind = "file"\ndownlink = "{tmp_path}/in"\n')
     (tmp_path / "in").mkdir()
-    (tmp_path / "in" / "pass.cadu").write_bytes(stream)
+    (tmp_path / "in/pass.cadu").write_bytes(stream)
     with operated(ground) as runner:
         wait_for(lambda: runner.octets_received == len(stream), "the telemetry")
     with operated(ground, "another") as runner:
-        (tmp_path / "in" / "next.cadu").write_bytes(stream[: 2 * CADU])
+        (tmp_path / "in/next.cadu").write_bytes(stream[: 2 * CADU])
         wait_for(lambda: runner.octets_received, "the next file")
         assert runner.octets_received == 2 * CADU
 
