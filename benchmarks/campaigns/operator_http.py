@@ -51,8 +51,7 @@ def main(rate: float = 20.0) -> int:
                 printed = (folder / "log").read_text(errors="replace")
                 if not diary.expect("B", "the page leads to a report", (folder / "end").exists(), printed):
                     return diary.close()
-                kind = "C" if is_loaded() else "B"
-                diary.expect(kind, f"within {LIMIT_S:.0f} s", spent <= LIMIT_S, f"{spent:.0f} s")
+                diary.expect("C" if is_loaded() else "B", f"within {LIMIT_S:.0f} s", spent <= LIMIT_S, f"{spent:.0f} s")
                 headers = {"Authorization": f"Bearer {(folder / 'token').read_text().strip()}"}
                 url = f"http://127.0.0.1:{api}/api/v1/"
                 with httpx.Client(base_url=url, headers=headers, timeout=60.0) as client:
@@ -62,6 +61,7 @@ def main(rate: float = 20.0) -> int:
                 return diary.close()
             finally:
                 kill_family(shell.pid)
+                shell.wait()
 
 
 def wait(reached: Callable[[], Any], seconds: float = 3600.0) -> bool:

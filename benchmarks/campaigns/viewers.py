@@ -50,8 +50,8 @@ async def _watched(base: str, part: Part, viewers: int, minutes: float) -> tuple
 
     samples: list[int] = []
     async with httpx.AsyncClient(base_url=base, timeout=60.0, limits=httpx.Limits(max_connections=None)) as client:
-        work = receive(), *map(read, range(viewers)), *(feed() for _ in range(viewers))
-        tasks = [*map(asyncio.create_task, work)]
+        tasks = [asyncio.create_task(one) for k in range(viewers) for one in (feed(), read(k))]
+        tasks.append(asyncio.create_task(receive()))
         while len(samples) < 60.0 * minutes / SAMPLE_S and not wrong:
             ended, _ = await asyncio.wait(tasks, timeout=SAMPLE_S, return_when=asyncio.FIRST_COMPLETED)
             wrong.update(str(one.exception() or "a feed ended") for one in ended)

@@ -161,7 +161,7 @@ def test_what_telemetry_does_not_confirm_is_refused(change, said, copy, tmp_path
         reconstruct(copy, tmp_path / "out", DataFolder(None))
 
 
-def test_only_a_payload_as_launched_reports_images(tmp_path):
+def test_only_a_payload_as_launched_reports_images():
     described = world()
     opened = open_world(described, DataFolder(None))
     launched = launch_payload(described, opened.camera, DataFolder(None)).parameters.flight

@@ -154,7 +154,7 @@ def test_a_catalogue_without_a_crater_is_refused(ground):
         add_catalogue(ground, stored, "none.csv")
 
 
-def test_a_withdrawn_catalogue_is_not_used_and_can_be_held_again(ground, tmp_path):
+def test_a_withdrawn_catalogue_is_not_used_and_can_be_held_again(ground):
     octets = b"id,latitude_deg,longitude_deg,diameter_m,depth_m\n1,2.0,3.0,6000.0,600.0\n"
     stored = ground.files.put_octets(octets)
     add_catalogue(ground, stored, "one.csv")

@@ -217,7 +217,7 @@ def test_a_bad_build_file_is_refused_with_its_key(row, tmp_path):
     assert message in str(error.value)
 
 
-def test_the_identity_of_a_build_is_that_of_what_it_runs(make_build, tmp_path):
+def test_the_identity_of_a_build_is_that_of_what_it_runs(make_build):
     first = load_build(make_build("one", program="pass"))
     file = first.folder / "build.toml"
     file.write_text(file.read_text().replace('name = "one"', 'name = "two"'))

@@ -263,7 +263,7 @@ def test_deeper_craters_weigh_more():
 
 
 @mark.filterwarnings("ignore:__array__ implementation:DeprecationWarning")  # of pycocotools itself
-def test_pycocotools_reads_the_annotations_and_scores_them_as_perfect(blob_dataset, capsys):
+def test_pycocotools_reads_the_annotations_and_scores_them_as_perfect(blob_dataset):
     path = blob_dataset.folder / "coco_train.json"
     truth = COCO(str(path))
     annotations = truth.loadAnns(truth.getAnnIds())
