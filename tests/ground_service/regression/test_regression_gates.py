@@ -423,6 +423,7 @@ def test_other_metrics_inform_and_never_decide():
     gates = judge(before, after, POLICY)
     volume = by_name(gates)["telemetry.octets_per_frame"]
     assert (volume.outcome, volume.reason) == ("informs", "worse (+55%, 12 passes)")
+    assert volume.level == approx(0.01 / sum(gate.outcome == "informs" for gate in gates))
     assert verdict_of(gates) == "pass"
     few = judge(suite(0, 3), suite(1, 3), POLICY)
     assert {gate.reason for gate in few if gate.outcome == "informs"} == {""}
