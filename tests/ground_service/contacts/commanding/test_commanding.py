@@ -113,7 +113,7 @@ self_destruct | {} | name: expected one of the 27 telecommands of the dictionary
 test_connection\0 | {} | name: expected one of the 27 telecommands of the dictionary
 perform_function | {"function_id": "dance", "argument_1": 0, "argument_2": 0} | function_id: expected one of
 perform_function | {"function_id": 1} | argument_1: expected a value
-perform_function | {"function_id": "start_observation", "duration_s": -1} | start_observation.duration_s: expected a number
+perform_function | {"function_id": "start_observation", "duration_s": -1} | start_observation.duration_s: expected
 set_housekeeping_interval | {"structure_id": 1, "interval_s": 0} | interval_s: expected
 set_housekeeping_interval | {"structure_id": 1, "interval_s": true} | interval_s: expected a finite number
 test_connection | {"extra": 1} | no such field
