@@ -129,14 +129,14 @@ def test_an_impossible_on_board_time_is_none_and_never_negative_garbage():
 
 def test_parts_of_a_packet_are_joined_where_their_counts_and_octets_agree():
     """A packet in three frames of 20 octets; both parts hold the second frame, the last one of a stranger differs."""
-    packet = append_crc(pack_packet(0x123, bytes(40), sequence_count=1))
+    packet = append_crc(pack_packet(0x123, bytes(42), sequence_count=1)[:-2])
     channel, form = (76, 0, 0, 20), lambda _: PacketForm()
     begin = Fragment(channel, True, False, 254, 0, 0, 20, packet[:40])
     end = Fragment(channel, False, True, 255, 1, 900, 920, packet[20:])
     stranger = replace(end, octets=b"x" + packet[21:])
     assert (begin.fit, end.fit) == (len(packet) - 40, len(packet) - 20)
     assert [fits(end, octets) for octets in (end.fit, end.fit - 1, UNKNOWN)] == [True, False, True]
-    assert fits(replace(end, ends=False), 5) is False and fits(replace(begin, ends=True), 5)
+    assert fits(replace(end, ends=False), 5) and fits(replace(begin, ends=True), 5)
     assert join([begin, stranger, end], form) == ([(76, packet)], [stranger])
     assert join([begin, replace(end, count=0, next_count=2)], form)[0] == []
 
