@@ -73,12 +73,14 @@ smoother|ground_service/evaluation/smoother\
 gates|ground_service/regression/gates/core ground_service/regression/gates/statistics\
 |ground_service/regression/test_regression_gates
 filter|payload_emulator/flight/navigation/filter/filter payload_emulator/flight/navigation/filter/map_offset \
+payload_emulator/flight/navigation/filter/attitude_monitor payload_emulator/flight/navigation/filter/dynamics \
 payload_emulator/flight/navigation/anchored/anchored payload_emulator/flight/navigation/anchored/correction \
 payload_emulator/flight/navigation/anchored/recovery \
 payload_emulator/flight/onboard/observer payload_emulator/flight/navigation/search/acquisition\
 |payload_emulator/flight/test_navigation_filter payload_emulator/flight/test_anchored \
 payload_emulator/flight/test_anchored_navigator payload_emulator/flight/test_observer \
-payload_emulator/flight/test_acquisition payload_emulator/flight/test_landmark_map
+payload_emulator/flight/test_acquisition payload_emulator/flight/test_landmark_map \
+payload_emulator/flight/test_attitude_monitor payload_emulator/flight/test_dynamics
 authorisation|ground_service/access/service ground_service/access/security|ground_service/access
 commanding|ground_service/contacts/commanding/service ground_service/contacts/commanding/core \
 payload_emulator/flight/onboard/commanding\

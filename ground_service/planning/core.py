@@ -401,7 +401,7 @@ def frames_between(start_utc_ns: int, stop_utc_ns: int, cadence_s: float) -> int
     return max(-((start_utc_ns - stop_utc_ns) // round(cadence_s * NS)), 1)
 
 
-COAST_M_S = 1.65e6
+COAST_M_S = 1.75e6
 """Along-track error, 1 sigma, after a coast of one revolution, times the duration of the window before it, if nothing
 was known before: what the filter states on tuning ground at 20 to 40 km (docs/results/navigation.md), .9 to 1.0 times
 this for windows up to 15 minutes and .7 for 35 minutes."""

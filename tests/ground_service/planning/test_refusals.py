@@ -192,7 +192,7 @@ def test_a_search_goes_around_a_hole_or_takes_the_ephemeris_that_has_none(ground
 
 
 def test_a_first_window_is_as_long_as_the_error_of_its_coast_requires():
-    """1,650 km s over the duration: 3 km need 550 s, and a longer stated duration stays."""
-    assert WindowSearch(first_coast_m=3_000.0).constraints().minimum_duration_s == approx(550.0)
+    """1,750 km s over the duration: 3.5 km need 500 s, and a longer stated duration stays."""
+    assert WindowSearch(first_coast_m=3_500.0).constraints().minimum_duration_s == approx(500.0)
     assert WindowSearch(first_coast_m=1e6).constraints().minimum_duration_s == 300.0
     assert WindowSearch().constraints().minimum_duration_s == 300.0

@@ -167,6 +167,15 @@ def test_sizes_that_do_not_fit_and_a_mirrored_image_give_no_place():
     assert search(replace(found, u_px=511.0 - found.u_px), landmarks, pose_at(), 5_000.0) is None
 
 
+def test_detections_without_a_size_take_no_part():
+    landmarks = crater_map()
+    found, _ = detected(landmarks, pose_at(), false=3)
+    sizes = found.diameter_px.copy()
+    sizes[:3] = -1.0, 0.0, np.nan
+    place = search(replace(found, diameter_px=sizes), landmarks, pose_at(3_000.0), 3_000.0)
+    assert place is not None and not set(place.detection) & {0, 1, 2}
+
+
 def test_more_is_asked_of_a_wider_search_and_of_a_smaller_risk():
     landmarks, true = crater_map(), pose_at()
     found, _ = detected(landmarks, true)
