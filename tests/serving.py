@@ -1,5 +1,6 @@
 """Waiting for a condition, and a service on a private port, for all tests."""
 
+import subprocess
 import threading
 import time
 import warnings
@@ -17,6 +18,11 @@ with warnings.catch_warnings():
     warnings.simplefilter("ignore")
     from fastapi.testclient import TestClient as TestClient
     from starlette.testclient import WebSocketDenialResponse as WebSocketDenialResponse
+
+
+def ran(command, check=False, **given):
+    """Run a command to its end; return its status and what it has printed."""
+    return subprocess.run(command, check=check, capture_output=True, text=True, **given)
 
 
 def wait_for(reached, what):

@@ -19,6 +19,7 @@ import pytest
 from pytest import fixture, mark
 
 from tests import cost
+from tests.serving import ran
 
 ROOT = Path(__file__).resolve().parent.parent
 PACKAGES = ["lunar", "tmtc", "reports", "payload_emulator", "studies", "ground_service", "linna", "kernels"]
@@ -28,10 +29,7 @@ LONGEST_FUNCTION = 80
 def lint_imports(folder):
     program = str(Path(sys.executable).with_name("lint-imports"))
     command = [program, "--config", str(folder / "pyproject.toml"), "--no-cache"]
-    return subprocess.run(
-        command, cwd=folder, capture_output=True, text=True, check=False,
-        env={"PYTHONPATH": str(folder), "PATH": "/usr/bin:/bin", "COLUMNS": "300"},
-    )  # fmt: skip
+    return ran(command, cwd=folder, env={"PYTHONPATH": str(folder), "PATH": "/usr/bin:/bin", "COLUMNS": "300"})
 
 
 @fixture()
@@ -369,7 +367,7 @@ FILES = {
 
 def release(*words):
     command = ["sh", str(ROOT / "deploy/release.sh"), *map(str, words)]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    done = ran(command)
     sys.stderr.write(done.stderr)
     return done.returncode
 

@@ -17,6 +17,7 @@ import docs_site
 from ground_service.web import pages
 from linna.cli import GROUPS
 from linna.parser import all_commands, command_parser
+from tests.serving import ran
 
 ROOT = Path(__file__).resolve().parents[1]
 DOCS = ROOT / "docs"
@@ -39,10 +40,11 @@ MARK = re.compile(
 @fixture(scope="session")
 def site(tmp_path_factory):
     folder = tmp_path_factory.mktemp("site")
-    built = subprocess.run(
+    built = ran(
         [sys.executable, "-m", "mkdocs", "build", "--strict", "--site-dir", str(folder)],
-        cwd=ROOT, env=os.environ | {"NO_MKDOCS_2_WARNING": "1"}, capture_output=True, text=True, check=False,
-    )  # fmt: skip
+        cwd=ROOT,
+        env=os.environ | {"NO_MKDOCS_2_WARNING": "1"},
+    )
     assert built.returncode == 0, built.stdout + built.stderr
     return folder
 
@@ -102,10 +104,10 @@ def test_links_and_anchors_of_help_lead_to_what_is_there():
 
 
 def test_spelling():
-    checked = subprocess.run(
+    checked = ran(
         [str(Path(sys.executable).with_name("typos")), "--config", str(ROOT / "typos.toml"), "docs", "README.md"],
-        cwd=ROOT, capture_output=True, text=True, check=False,
-    )  # fmt: skip
+        cwd=ROOT,
+    )
     assert checked.returncode == 0, checked.stdout
 
 

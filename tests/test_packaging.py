@@ -25,7 +25,7 @@ from pytest import fixture, mark
 
 from linna import __version__
 from tests.ground_service.conftest import free_port
-from tests.serving import wait_for
+from tests.serving import ran, wait_for
 
 ROOT = Path(__file__).resolve().parents[1]
 TAKEN = ["PYTHONPATH", "LINNA_DATA", "LINNA_HOME", "LINNA_SERVER"]
@@ -43,10 +43,9 @@ def built(tmp_path_factory):
     """
     folder = tmp_path_factory.mktemp("package")
     source = folder / "source"
-    listed = subprocess.run(
-        ["git", "ls-files", "--cached", "--others", "--exclude-standard"], cwd=ROOT, capture_output=True, text=True,
-        check=True,
-    ).stdout.splitlines()  # fmt: skip
+    listed = ran(
+        ["git", "ls-files", "--cached", "--others", "--exclude-standard"], cwd=ROOT, check=True
+    ).stdout.splitlines()
     for name in listed:
         if not name.startswith("tests/") and (ROOT / name).is_file():
             (source / name).parent.mkdir(parents=True, exist_ok=True)
@@ -56,7 +55,7 @@ def built(tmp_path_factory):
     page.parent.mkdir(parents=True)
     page.write_text("First pass")
     code = f"import setuptools.build_meta as b, sys; b.build_wheel({str(folder)!r}); b.build_sdist({str(folder)!r})"
-    done = subprocess.run([sys.executable, "-c", code], cwd=source, capture_output=True, text=True, check=False)
+    done = ran([sys.executable, "-c", code], cwd=source)
     assert done.returncode == 0, done.stdout[-2000:] + done.stderr[-2000:]
     return folder
 
@@ -130,14 +129,12 @@ def pip_of(programs, *arguments):
     """Run pip for an environment: that of the base interpreter, as `make` does, else that of the environment."""
     python = programs / "python"
     pip = [sys._base_executable, "-m", "pip", "--python", python] if has_base_pip() else [python, "-m", "pip"]
-    return subprocess.run([*pip, *arguments], env=OUTSIDE, capture_output=True, text=True, check=False)
+    return ran([*pip, *arguments], env=OUTSIDE)
 
 
 def in_folder(folder, *command):
     """Output of a command that runs outside of the checkout."""
-    done = subprocess.run(
-        command, cwd=folder, env=OUTSIDE | {"XDG_DATA_HOME": str(folder)}, capture_output=True, text=True, check=False,
-    )  # fmt: skip
+    done = ran(command, cwd=folder, env=OUTSIDE | {"XDG_DATA_HOME": str(folder)})
     assert done.returncode == 0, f"{command}\n{done.stderr[-2000:]}"
     return done.stdout
 

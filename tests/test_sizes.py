@@ -2,11 +2,12 @@
 
 import importlib.util
 import itertools
-import subprocess
 import sys
 from pathlib import Path
 
 from pytest import mark
+
+from tests.serving import ran
 
 _SPEC = importlib.util.spec_from_file_location("sizes", Path(__file__).with_name("sizes.py"))
 sizes = importlib.util.module_from_spec(_SPEC)
@@ -22,7 +23,7 @@ def test_no_package_is_larger_than_the_table_allows():
 def test_a_change_of_the_table_that_raises_an_entry_lowers_another_by_more():
     """Both the uncommitted change and the newest committed one."""
     log = ["git", "-C", str(sizes.ROOT), "log", "-2", "--format=%H", "--", "tests/sizes.csv"]
-    revisions = subprocess.run(log, capture_output=True, text=True, check=False).stdout.split()
+    revisions = ran(log).stdout.split()
     tables = [sizes.load_table(sizes.TABLE.read_text(encoding="utf-8"))]
     tables += [table for table in map(sizes.committed_table, revisions) if table is not None]
     assert [sizes.unpaid(before, after) for after, before in itertools.pairwise(tables)] in ([], [[]], [[], []])

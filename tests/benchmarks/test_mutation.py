@@ -2,12 +2,11 @@
 
 import json
 import math
-from types import SimpleNamespace
 
 import numpy as np
-from pytest import approx, fixture, mark, raises
+from pytest import approx, mark, raises
 
-from benchmarks import _rows, mutation, mutation_plugin
+from benchmarks import _rows, mutation
 from benchmarks.__main__ import NAMES, main
 from benchmarks._rows import NotMeasured, Row, line, needs, report
 from benchmarks.render import compare_renderings, thinned
@@ -49,56 +48,6 @@ def test_element_types_and_wording_are_left_out(difference):
 )
 def test_what_decides_is_tested(difference):
     assert mutation.reason_left_out(difference) is None
-
-
-@fixture
-def state(monkeypatch):
-    """Return the records of mutmut, without mutmut."""
-    recorded = SimpleNamespace(_stats=set(), duration_by_test={"a": 1.0})
-    monkeypatch.setattr(mutation_plugin, "_state", lambda: recorded)
-    monkeypatch.setattr(mutation_plugin, "_reached", {})
-    return recorded
-
-
-def set_up(state, name, scope, calls):
-    """Run the hook around a fixture that makes these calls."""
-    hook = mutation_plugin.pytest_fixture_setup(SimpleNamespace(argname=name, scope=scope))
-    next(hook)
-    state._stats.update(calls)
-    with raises(StopIteration):
-        hook.send(None)
-
-
-def test_what_a_shared_fixture_calls_is_credited_to_every_test_that_uses_it(state):
-    state._stats.add("own")
-    set_up(state, "shared", "module", {"inner"})
-    set_up(state, "alone", "function", {"other"})
-    assert state._stats == {"own", "inner", "other"}
-    state._stats.clear()
-    mutation_plugin.pytest_runtest_teardown(SimpleNamespace(fixturenames=["shared", "alone"]))
-    assert state._stats == {"inner"}
-    state._stats.clear()
-    mutation_plugin.pytest_runtest_teardown(SimpleNamespace(fixturenames=["alone"]))
-    assert state._stats == set()
-
-
-def test_the_time_of_a_test_holds_that_of_its_fixtures(state):
-    for when, total in (("call", 1.0), ("setup", 3.5)):
-        mutation_plugin.pytest_runtest_makereport(SimpleNamespace(nodeid="a"), SimpleNamespace(when=when, duration=2.5))
-        assert state.duration_by_test == {"a": total}
-
-
-def test_the_fastest_files_are_run_first_and_their_tests_stay_in_order(tmp_path, monkeypatch):
-    names = ["slow.py::b", "slow.py::a", "quick.py::b", "unknown.py::x", "quick.py::a"]
-    items = [SimpleNamespace(nodeid=name) for name in names]
-    path = tmp_path / "statistics.json"
-    monkeypatch.setattr(mutation_plugin, "_STATISTICS", path)
-    mutation_plugin.pytest_collection_modifyitems(items)
-    assert [item.nodeid for item in items] == names
-    durations = {"slow.py::a": 2.0, "slow.py::b": 0.1, "quick.py::a": 1.0, "quick.py::b": 1.0}
-    path.write_text(json.dumps({"duration_by_test": durations}))
-    mutation_plugin.pytest_collection_modifyitems(items)
-    assert [item.nodeid for item in items] == [names[3], names[2], names[4], names[0], names[1]]
 
 
 def rendering(dark_columns, radiance=0.02, size=16):

@@ -3,7 +3,6 @@
 import inspect
 import json
 import re
-import subprocess
 import sys
 import threading
 import tracemalloc
@@ -23,6 +22,7 @@ from ground_service.settings import Settings
 from lunar.timescales import parse_utc, ticks_from_utc_ns
 from tests.ground_service import client_generator
 from tests.ground_service.conftest import cells, event_packet
+from tests.serving import ran
 from tmtc.downlink import encode_cadus
 
 EPHEMERIS = json.loads("""{"id": 1, "name": "reference.oem", "object_name": "SELENITA", "frame": "ICRF", "states": 241,
@@ -358,7 +358,7 @@ def test_a_client_that_is_not_closed_lets_python_end(tmp_path):
     script = "import linna; passes = linna.open({!r}); print(len(passes))"
     open_ground(tmp_path / "home").close()
     command = [sys.executable, "-c", script.format(str(tmp_path / "home"))]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+    done = ran(command)
     assert (done.returncode, done.stdout, done.stderr) == (0, "0\n", "")
 
 

@@ -18,6 +18,7 @@ from pytest import mark, raises, skip
 from ground_service.settings import Settings
 from studies.harness.parts import Part, free_port, listens
 from tests.ground_service.conftest import cells
+from tests.serving import ran
 
 ROOT = Path(__file__).resolve().parents[2]
 COMPOSE = yaml.safe_load((ROOT / "docker-compose.yml").read_text())
@@ -206,10 +207,11 @@ def test_the_runner_has_no_secret_no_network_and_no_archive():
 def sh(name, programs="", *words, **environment):
     """Run a script of the deployment, with a folder of programs before the others."""
     given = {key: str(value) for key, value in environment.items()}
-    return subprocess.run(
-        ["sh", str(ROOT / "deploy" / name), *words], env={"PATH": f"{programs}:{os.environ['PATH']}", **given},
-        stdin=subprocess.DEVNULL, capture_output=True, text=True, check=False,
-    )  # fmt: skip
+    return ran(
+        ["sh", str(ROOT / "deploy" / name), *words],
+        env={"PATH": f"{programs}:{os.environ['PATH']}", **given},
+        stdin=subprocess.DEVNULL,
+    )
 
 
 def program(folder, name, text):

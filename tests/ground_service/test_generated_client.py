@@ -3,7 +3,6 @@
 import importlib
 import json
 import os
-import subprocess
 import sys
 from datetime import UTC, datetime
 from pathlib import Path
@@ -12,7 +11,7 @@ from pytest import fixture
 
 from ground_service.app import create_app
 from ground_service.settings import Settings
-from tests.serving import TestClient
+from tests.serving import TestClient, ran
 
 PACKAGE = "linna_generated_client"
 
@@ -34,7 +33,7 @@ def generated(service, tmp_path_factory):
     ]  # fmt: skip
     # The generator calls ruff, which lies in the same folder.
     environment = {**os.environ, "PATH": f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"}
-    made = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, check=False)
+    made = ran(command, cwd=folder, env=environment)
     assert made.returncode == 0, made.stdout + made.stderr
     sys.path.insert(0, str(folder))
     yield folder / PACKAGE

@@ -3,7 +3,6 @@
 import json
 import re
 import shutil
-import subprocess
 import sys
 from ast import literal_eval
 from dataclasses import replace
@@ -29,7 +28,7 @@ from ground_service.worker.backup import backup
 from ground_service.worker.condition import WorkCounts, newest_backup_utc_ns, read_condition
 from ground_service.worker.jobs import run_job
 from tests.ground_service.conftest import cells
-from tests.serving import TestClient
+from tests.serving import TestClient, ran
 
 DEPLOY = Path(__file__).resolve().parents[2] / "deploy"
 RULES = DEPLOY / "prometheus/linna.rules.yml"
@@ -176,7 +175,7 @@ def test_the_configuration_of_prometheus_is_valid_and_has_the_jobs_of_the_alerts
     if program is None:
         skip("promtool is not installed")
     place = RULES.with_name("prometheus.yml")
-    checked = subprocess.run([program, "check", "config", str(place)], capture_output=True, text=True, check=False)
+    checked = ran([program, "check", "config", str(place)])
     assert checked.returncode == 0, checked.stdout + checked.stderr
     jobs = {one["job_name"] for one in yaml.safe_load(place.read_text())["scrape_configs"]}
     assert set(re.findall(r'job="([^"]+)"', RULES.read_text())) == jobs
@@ -249,7 +248,7 @@ def test_alerts_fire_and_only_when_they_should(tmp_path):
     program = shutil.which("promtool")
     if program is None:
         skip("promtool is not installed")
-    checked = subprocess.run([program, "check", "rules", str(RULES)], capture_output=True, text=True, check=False)
+    checked = ran([program, "check", "rules", str(RULES)])
     assert checked.returncode == 0, checked.stderr
     healthy = series_of(HEALTHY)
     names = [rule["alert"] for rule in alerts()]
@@ -265,9 +264,7 @@ def test_alerts_fire_and_only_when_they_should(tmp_path):
     tests += [replicas_test(healthy), *backup_tests(healthy)]
     document = {"rule_files": [str(RULES)], "evaluation_interval": "1m", "tests": tests}
     (tmp_path / "tests.yml").write_text(yaml.safe_dump(document))
-    done = subprocess.run(
-        [program, "test", "rules", str(tmp_path / "tests.yml")], capture_output=True, text=True, check=False
-    )
+    done = ran([program, "test", "rules", str(tmp_path / "tests.yml")])
     assert done.returncode == 0, done.stdout + done.stderr
 
 

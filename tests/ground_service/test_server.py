@@ -22,6 +22,7 @@ from ground_service.settings import Settings
 from ground_service.toml import LINE_PATTERN_JSON, require_line
 from studies.harness.parts import listens
 from tests.ground_service.conftest import free_port, wait_for
+from tests.serving import ran
 
 
 def test_a_port_in_use_is_one_clear_line(tmp_path):
@@ -78,7 +79,7 @@ def test_the_service_starts_without_libraries_that_only_computations_need():
         "import sys, ground_service.app; "
         "print([m for m in sys.modules if m in ('scipy', 'matplotlib', 'cv2', 'numba', 'torch', 'celery')])"
     )
-    found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    found = ran([sys.executable, "-c", code], check=True)
     assert found.stdout.strip() == "[]"
 
 

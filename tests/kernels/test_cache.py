@@ -13,6 +13,7 @@ from unittest.mock import MagicMock
 from pytest import fixture, mark
 
 from kernels import KEPT_S, keep, kept, memory
+from tests.serving import ran
 
 ROOT = Path(__file__).resolve().parents[2]
 CALLEE = """
@@ -290,7 +291,7 @@ def test_another_c_library_is_left_alone(library):
 
 @mark.skipif(not hasattr(ctypes.CDLL(None), "malloc_trim"), reason="needs glibc")
 def test_free_memory_between_blocks_in_use_goes_back():
-    done = subprocess.run([sys.executable, "-c", RESIDENT], capture_output=True, text=True, check=True)
+    done = ran([sys.executable, "-c", RESIDENT], check=True)
     full, before, after, _ = map(int, done.stdout.split())
     assert full > 200
     assert after < full - 150, (full, before, after)

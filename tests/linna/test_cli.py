@@ -3,7 +3,6 @@
 import argparse
 import json
 import shlex
-import subprocess
 import sys
 from pathlib import Path
 from types import SimpleNamespace
@@ -23,12 +22,12 @@ from payload_emulator.session.scenario import load_scenario
 from payload_emulator.session.world.recipe import load_recipe, procedural_recipe
 from tests.ground_service.conftest import START, event_packet, save_circle, write_manifest
 from tests.scenarios import still_scenario
-from tests.serving import served
+from tests.serving import ran, served
 from tmtc.downlink import encode_cadus
 
 
 def linna(*arguments):
-    return subprocess.run([sys.executable, "-m", "linna", *arguments], capture_output=True, text=True, check=False)
+    return ran([sys.executable, "-m", "linna", *arguments])
 
 
 def test_help_groups_the_commands_by_task():
@@ -44,7 +43,7 @@ def test_help_imports_no_numerical_library():
         "import sys, linna.cli; linna.cli.run(['--help']); print([m for m in sys.modules if m in "
         "('numpy', 'numba', 'matplotlib', 'cv2', 'sqlalchemy', 'fastapi', 'onnxruntime')])"
     )
-    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    result = ran([sys.executable, "-c", code], check=True)
     assert result.stdout.strip().endswith("[]")
 
 
@@ -169,7 +168,7 @@ def test_a_list_of_this_machine_imports_neither_http_nor_kernels(tmp_path):
         "print(status, {'fastapi', 'httpx', 'numba', 'numpy'} & set(sys.modules))"
     )
     command = [sys.executable, "-c", script, str(tmp_path / "home")]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=True)
+    done = ran(command, check=True)
     none = "no passes: telemetry alone makes none; a pass is a flown window, an imported archive, or a defined interval"
     assert done.stdout == f"{none}\n0 set()\n"
 
@@ -236,7 +235,7 @@ def test_a_failed_job_is_reported_in_one_line_that_names_the_file(tmp_path):
     archive.mkdir()
     (archive / "manifest.json").write_text("{}")
     words = [sys.executable, "-m", "linna", "ingest", str(archive), "--home", str(tmp_path / "home")]
-    done = subprocess.run(words, capture_output=True, text=True, timeout=60, check=False)
+    done = ran(words)
     assert (done.returncode, done.stdout) == (2, "")
     progress, line = done.stderr.splitlines()
     assert progress == f"ingesting {archive} ..."

@@ -4,7 +4,6 @@ import io
 import logging
 import os
 import re
-import subprocess
 import sys
 from dataclasses import replace
 from functools import partial
@@ -22,6 +21,7 @@ from reports.pass_report import pass_document
 from reports.pdf_pages import _typeset, pdf_of, print_form
 from reports.render import render_html, render_pages
 from tests.reports import example
+from tests.serving import ran
 
 _POINTS = 72.0
 
@@ -146,7 +146,7 @@ def test_the_process_of_a_report_does_not_keep_what_typesetting_computes():
         "octets = pdf_of(print_form(Document('Test', 'Title', 't', (), (Paragraph('x'),))), '')\n"
         "print(octets[:5], any(name.partition('.')[0] == 'typst' for name in sys.modules))"
     )
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    done = ran([sys.executable, "-c", program], check=True)
     assert done.stdout == "b'%PDF-' False\n"
 
 
@@ -164,12 +164,11 @@ def test_the_characters_of_the_font_are_known_without_matplotlib_the_second_time
         "print(ord('σ') in _characters(), ord('月') in _characters(), 'matplotlib' in sys.modules)"
     )
     said = [
-        subprocess.run(
-            [sys.executable, "-c", program],
-            env={**os.environ, "NUMBA_CACHE_DIR": str(tmp_path / "kept")}, capture_output=True, text=True, check=True,
+        ran(
+            [sys.executable, "-c", program], env={**os.environ, "NUMBA_CACHE_DIR": str(tmp_path / "kept")}, check=True
         ).stdout
         for _ in range(2)
-    ]  # fmt: skip
+    ]
     assert said == ["True False True\n", "True False False\n"]
 
 

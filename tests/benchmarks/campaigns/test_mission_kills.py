@@ -1,21 +1,20 @@
 """The distributed form of a mission run: processes are killed, and the figures are those of the embedded form."""
 
 import json
-import socket
 import sys
 import threading
 from pathlib import Path
 
-from pytest import MonkeyPatch, approx, mark, raises
+from pytest import approx, mark, raises
 
 from benchmarks._servers import PidFile, PostgresServer
-from benchmarks.campaigns._kills import PHASES, Keeper, Kill, PlannedKill, plan_kills
+from benchmarks.campaigns._kills import Keeper, Kill, PlannedKill
 from benchmarks.campaigns.mission_kills import KillableSpacecraft, KillTerms, run_killed
 from ground_service.contacts.links import service as links
 from ground_service.errors import GroundError
 from lunar.datafolder import DataFolder
 from payload_emulator.session.scenario import parse_scenario
-from studies.harness.parts import Part, kill_family, runs
+from studies.harness.parts import Part, runs
 from studies.mission_run.run import RunTerms, run_mission
 from tests.mission_reports import figures_of
 from tests.scenarios import commanded_scenario
@@ -67,62 +66,6 @@ def test_kills_do_not_change_the_figures_of_a_run(tmp_path, monkeypatch):
     # Nothing is left of the deployment.
     assert not any(runs(pid) for pid, _ in json.loads((folder / "processes.json").read_text()).values())
     assert not Path((folder / "postgres-folder").read_text()).exists()
-
-
-def test_a_kill_waits_for_the_process_that_it_kills_and_for_no_later_one(tmp_path, monkeypatch):
-    """The run starts the spacecraft again as soon as it notices the kill."""
-    part = sleeper(tmp_path)
-    part.start()
-    first = part.pid
-
-    def kill_and_start(pid):
-        kill_family(pid)
-        part.start()
-
-    monkeypatch.setattr("studies.harness.parts.kill_family", kill_and_start)
-    part.kill()
-    monkeypatch.undo()
-    assert not runs(first) and runs(part.pid)
-    part.end()
-
-
-def test_a_spacecraft_is_started_again_after_the_kill_has_ended():
-    done = []
-    killing, started = threading.Event(), threading.Event()
-
-    class SlowPart:
-        def start(self):
-            done.append("start")
-
-        def kill(self):
-            killing.set()
-            started.wait(0.5)  # a restart that does not wait comes now
-            done.append("killed")
-
-    left, right = socket.socketpair()
-    spacecraft = KillableSpacecraft.__new__(KillableSpacecraft)
-    spacecraft.__dict__ |= {"_part": SlowPart(), "_lock": threading.Lock(), "_console": left}
-    with left, right, MonkeyPatch.context() as patch:
-        patch.setattr(KillableSpacecraft, "_disconnect", lambda _: None)
-        killer = threading.Thread(target=spacecraft.kill)
-        killer.start()
-        killing.wait()
-        spacecraft.restart()
-        started.set()
-        killer.join()
-        spacecraft._lines.close()
-    assert done == ["killed", "start"] and not spacecraft.was_killed
-
-
-def test_kills_are_planned_by_their_seed_for_every_part_in_every_phase():
-    parts = ["api", "database", "spacecraft"]
-    found = plan_kills(7, parts, 0, 30 * HOUR_NS, 30)
-    assert found == plan_kills(7, parts, 0, 30 * HOUR_NS, 30) != plan_kills(8, parts, 0, 30 * HOUR_NS, 30)
-    assert [one.utc_ns // HOUR_NS for one in found] == list(range(30))
-    assert {one.part for one in found[:3]} == {one.part for one in found[27:]} == set(parts)
-    assert {one.phase for one in found} == set(PHASES)
-    assert all(0.0 <= one.delay_s <= 2.0 and 0.0 <= one.down_s <= 2.0 for one in found)
-    assert plan_kills(7, parts, 0, HOUR_NS, 0) == ()
 
 
 def sleeper(folder):

@@ -511,15 +511,6 @@ def test_many_images_are_thinned_out_evenly():
     assert [one.frame_number for one in report.gallery] == [100, 102, 104, 107, 109, 111]
 
 
-def test_frames_are_accounted_for(report):
-    assert report.accounting == FrameAccounting(
-        expected=14, acquired=12, processed=11, with_detections=11, navigated=12, bad_image=1,
-        quality={"ok": 11, "dark": 1},
-    )  # fmt: skip
-    more = anchored(frame_number=np.repeat(100 + np.arange(6), 2))
-    assert evaluated(navigation=(more,)).accounting.navigated == 6
-
-
 def test_the_pointing_is_described_by_what_is_known_of_it():
     nadir = Viewing(CAMERA).pointed(circle(CADENCE_S * np.arange(FRAMES))[0])
     every = evaluated(viewing=Viewing(CAMERA, attitude_utc_ns=TIMES, q_wxyz=quaternion_from_matrix(nadir)))

@@ -1,7 +1,6 @@
 """Builds as programs inside limits: what becomes of those that behave and do not; their verdicts in lists."""
 
 import dataclasses
-import subprocess
 import tempfile
 import time
 import venv
@@ -19,6 +18,7 @@ from ground_service.regression.model import REASONS_LIMIT, JudgedGate, Regressio
 from ground_service.regression.sandbox import SandboxRefused
 from ground_service.regression.store import list_builds
 from linna.cli import run as run_command
+from tests.serving import ran
 
 LIMITS = "\n[limits]\nwall_s = 20\ncpu_s = 10\nmemory_mib = 300\nfile_mib = 4\nfolder_mib = 12\n"
 
@@ -69,7 +69,7 @@ def test_builds_run_where_python_is_installed_below_tmp():
         venv.create(name)
         command = [f"{name}/bin/python", "-c", f"from {host.__name__} import *; print(protection())"]
         environment = {"PYTHONPATH": str(host.package_root())}
-        said = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
+        said = ran(command, env=environment, check=True)
     assert said.stdout.startswith("bubblewrap, private root, user ")
 
 

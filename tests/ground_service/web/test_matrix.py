@@ -5,7 +5,6 @@ LINNA_PAGE_TABLE=FILE writes the results as the table of the documentation: `mak
 
 import itertools
 import os
-import subprocess
 from pathlib import Path
 
 import numpy as np
@@ -30,7 +29,7 @@ from tests.ground_service.web.test_in_browser import answered, settled
 from tests.ground_service.web.test_shift import MISSION, Spacecraft
 from tests.lazy import Lazy, expect
 from tests.scenarios import GOLDEN
-from tests.serving import wait_for
+from tests.serving import ran, wait_for
 
 FONTS = {"DejaVu": "DejaVu Sans", "Arial": "Liberation Sans"}
 """Fonts by the name in the table; Liberation Sans has the widths of Arial."""
@@ -285,7 +284,7 @@ def newcomer(browser, empty_service):
 
 
 def test_the_fonts_of_the_matrix_are_installed():
-    listed = subprocess.run(["fc-list", ":", "family"], capture_output=True, text=True, check=True).stdout
+    listed = ran(["fc-list", ":", "family"], check=True).stdout
     assert [family for family in FONTS.values() if family not in listed] == []
 
 

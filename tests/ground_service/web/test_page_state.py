@@ -1,6 +1,5 @@
 """Pages keep their state in the address, differ by role, and show what was flown, in Chromium."""
 
-import csv
 import re
 
 from pytest import approx, fixture
@@ -82,18 +81,6 @@ def test_codes_are_steps_with_their_names_and_hashes_are_listed(page):
     listed = page.get_by_label("values: model hash")
     expect(listed.locator("code").first).to_have_text(re.compile("^[0-9a-f]{8}$"))
     expect(listed.locator("canvas")).to_have_count(0)
-
-
-def test_a_csv_file_has_every_sample(page):
-    settled(page, "/telemetry")
-    link = page.get_by_role("link", name="CSV of all samples")
-    shows(page, "#charts", "40 samples")
-    with page.expect_download() as started:
-        link.click()
-    with open(started.value.path(), newline="") as file:
-        rows = list(csv.DictReader(file))
-    assert len(rows) == 40
-    assert "temperature_c" in rows[0]
 
 
 def test_events_of_all_passes_are_filtered_in_the_address(page):
@@ -272,23 +259,6 @@ def test_the_planner_opens_in_the_time_of_the_ephemeris_and_searches_for_its_spa
         expect(page).to_have_url(re.compile("latitude-min=-90"))
         page.reload()
         expect(page.locator("#latitude-min")).to_have_value("-90")
-
-
-def test_a_live_view_takes_matches_from_the_payload(page, console, live_frames):
-    settled(page, "/live")
-    expect(page.locator("#state")).to_have_text("connected")
-    message = live_frames[4] | {"terrain": {"name": "procedural (seed 5)", "real": False}}
-    near = {"u_px": 101.0, "v_px": 121.0, "diameter_px": 41.0, "score": 0.9}  # on a crater, not identified
-    message["detections"] = [near, {**near, "u_px": 300.0, "crater_id": 7}]
-    console.say(message)
-    shows(page, "#numbers", "2, 1 matched")
-    expect(page.locator("#terrain")).to_have_text("Terrain: procedural (seed 5).")
-    expect(page.locator("#frame")).to_have_attribute("data-shown", re.compile("[1-9]"))
-    ring = "([u, v]) => Array.from(document.getElementById('frame').getContext('2d').getImageData(u, v, 1, 1).data)"
-    matched = page.evaluate(ring, [321, 121])
-    unmatched = page.evaluate(ring, [122, 121])
-    assert matched[1] > 150 and matched[0] < 200 and matched[2] < 200, matched  # green
-    assert unmatched[2] > 150, unmatched  # blue
 
 
 @fixture

@@ -18,7 +18,7 @@ from ground_service.store import audit
 from ground_service.store.database import open_database, prepare_database
 from ground_service.store.models import METADATA
 from tests.ground_service.conftest import free_port
-from tests.serving import wait_for
+from tests.serving import ran, wait_for
 
 SYSTEM = "/usr/sbin:/usr/bin:/sbin:/bin"
 DEPLOY = Path(__file__).resolve().parents[3] / "deploy"
@@ -39,10 +39,7 @@ class Server:
 
     def run(self, *words, check=True):
         environment = {"PATH": f"{self.bin}:{SYSTEM}", "LINNA_WAL": str(self.wal)}
-        return subprocess.run(
-            [*self.user, *words], check=check, cwd=self.folder, env=environment, text=True,
-            capture_output=True,
-        )  # fmt: skip
+        return ran([*self.user, *words], check=check, cwd=self.folder, env=environment)  # fmt: skip
 
     def start(self):
         script = (self.scripts / "postgres.sh").read_text()

@@ -1,6 +1,6 @@
 """Labels against rims found by casting rays; the EXR reader against files written field by field."""
 
-from math import cos, degrees, hypot, isnan, pi, radians, sin, sqrt
+from math import degrees, hypot, isnan, radians, sqrt
 
 import numpy as np
 from numpy.linalg import norm
@@ -11,12 +11,10 @@ from lunar.camera import BrownCamera, PinholeCamera, nadir_camera_from_mcmf, poi
 from lunar.catalogue import make_catalogue
 from lunar.constants import MOON_RADIUS_M
 from lunar.datafolder import find_data
-from lunar.frames import axis_rotation, mcmf_from_spherical
+from lunar.frames import mcmf_from_spherical
 from payload_emulator.errors import RendererError
-from payload_emulator.sim.render import raymarch
 from payload_emulator.sim.render.cycles import read_exr
 from payload_emulator.sim.render.labels import label_frame, project_craters
-from payload_emulator.sim.render.light import sun_direction_mcmf
 from payload_emulator.sim.render.raymarch import cast
 from payload_emulator.sim.terrain.opening import open_terrain
 from tests.payload_emulator.sim.cast_rims import rim_errors
@@ -52,52 +50,6 @@ def test_a_crater_below_is_as_wide_as_the_lens_makes_it_and_rim_height_moves_one
     )
     # x = 30 km, and the ground falls 0.26 km over that: u = f x / z, 11.4 px for this kilometre.
     assert high - low == approx(CAMERA.focal_px * 30.0 * (1.0 / 19.26 - 1.0 / 20.26), rel=0.02)
-
-
-def test_labels_lie_on_rims_found_by_casting_rays(formula_terrain):
-    height = 1200.0
-    terrain = formula_terrain(lambda latitude, longitude: height + 0.0 * latitude)
-    errors = []
-    for tilt, yaw, east in ((0.0, 0.0, 0.25), (3.0, 1.0, 0.35), (-2.0, 2.0, -0.3)):
-        position, nadir = pose(0.3, 2.0)
-        rotation = axis_rotation(3, yaw) @ axis_rotation(1, radians(tilt)) @ nadir
-        latitude, longitude = 0.3 + radians(0.2), 2.0 + radians(east)
-        catalogue = crater_at(degrees(latitude), degrees(longitude), 9000.0, height)
-        label = project_craters(catalogue, CAMERA, position, rotation)
-        toward = sun_direction_mcmf(0.6, 0.0, 0.3, 2.0)
-        picture = raymarch.render(terrain, CAMERA, position, rotation, toward)
-        v, u = np.mgrid[0:512, 0:512]
-        points = position + picture.range_m[..., None] * (CAMERA.rays(np.stack([u, v], axis=-1)) @ rotation)
-        centre = mcmf_from_spherical(latitude, longitude, 0.0) / MOON_RADIUS_M
-        up = points / norm(points, axis=-1, keepdims=True)
-        arc = np.arccos(np.clip(up @ centre, -1.0, 1.0)) * MOON_RADIUS_M
-        # The disc within the rim: its centroid and area are those of the label's ellipse.
-        share = np.clip((4500.0 - arc) / 135.0 + 0.5, 0.0, 1.0)
-        mean_u, mean_v = (share * u).sum() / share.sum(), (share * v).sum() / share.sum()
-        ellipse = pi / 4.0 * label.major_px[0] * label.minor_px[0]
-        assert share.sum() == approx(ellipse, rel=0.02)
-        rim_middle = project_rim_middle(catalogue, position, rotation)
-        errors += [mean_u - rim_middle[0], mean_v - rim_middle[1]]
-    # Demanded: 0.1 px rms.
-    assert sqrt(np.mean(np.square(errors))) <= 0.1
-
-
-def project_rim_middle(catalogue, position, rotation):
-    """Centroid of the projected disc, by many small craters' centres spread evenly over it."""
-    radius = 0.5 * catalogue.diameter_m[0] / MOON_RADIUS_M
-    n = np.arange(4000) + 0.5
-    arc, azimuth = radius * np.sqrt(n / 4000.0), n * pi * (3.0 - sqrt(5.0))
-    latitude, longitude = catalogue.latitude_rad[0], catalogue.longitude_rad[0]
-    sine = sin(latitude) * np.cos(arc) + cos(latitude) * np.sin(arc) * np.cos(azimuth)
-    east = np.arctan2(np.sin(azimuth) * np.sin(arc) * cos(latitude), np.cos(arc) - sin(latitude) * sine)
-    spread = make_catalogue(
-        np.arcsin(sine), longitude + east, np.full(n.size, 3000.0), source="t",
-        rim_height_m=np.full(n.size, catalogue.rim_height_m[0])
-    )  # fmt: skip
-    labels = project_craters(spread, CAMERA, position, rotation)
-    # Ground per pixel, up to a factor: equal craters cover as many pixels as the picture gives them.
-    weight = labels.major_px * labels.minor_px
-    return np.average(labels.u_px, weights=weight), np.average(labels.v_px, weights=weight)
 
 
 def test_craters_cut_by_the_edge_say_so_and_those_out_of_sight_or_behind_the_limb_are_none():
