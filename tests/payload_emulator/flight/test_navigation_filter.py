@@ -516,6 +516,31 @@ def test_the_slope_is_the_derivative_of_state_and_likelihood_by_the_size_of_the_
     assert 0.0 < information < 0.05
 
 
+def test_the_slope_after_a_measurement_and_its_score_are_derivatives_of_a_linear_update():
+    rng = default_rng(6)
+    design, root, change = rng.standard_normal((4, 3)), rng.standard_normal((3, 3)), rng.standard_normal((3, 3))
+    innovation, moving = 2.0 * rng.standard_normal(4), rng.standard_normal(3)
+
+    def measured(x):
+        """Mean, covariance and log-likelihood of the prior root root' + x change change' whose mean moves with x."""
+        prior, left = root @ root.T + x * change @ change.T, innovation - design @ (x * moving)
+        spread = design @ prior @ design.T + eye(4)
+        gain = np.linalg.solve(spread, design @ prior).T
+        logarithm = -0.5 * (left @ np.linalg.solve(spread, left) + np.linalg.slogdet(spread)[1])
+        return x * moving + gain @ left, prior - gain @ design @ prior, logarithm, spread, gain
+
+    low, (_, _, _, spread, gain), high = measured(-1e-4), measured(0.0), measured(1e-4)
+    slope = kalman.Slope(moving, change @ change.T)
+    after, (score, information) = kalman._sloped(slope, design, gain, spread, innovation)
+    assert_allclose(after.mean, (high[0] - low[0]) / 2e-4, rtol=1e-5)
+    assert_allclose(after.covariance, (high[1] - low[1]) / 2e-4, rtol=1e-5)
+    assert score == approx((high[2] - low[2]) / 2e-4, rel=1e-5)
+    relative = np.linalg.solve(spread, design @ change @ change.T @ design.T)
+    moved = design @ moving
+    assert information == approx(0.5 * np.trace(relative @ relative) + moved @ np.linalg.solve(spread, moved))
+    assert kalman._sloped(None, design, gain, spread, innovation) == (None, (0.0, 0.0))
+
+
 def test_an_offset_of_another_size_scales_its_part_of_state_and_slope():
     start = first_state(40.0, learns_offset=True)
     covariance = start.covariance.copy()
@@ -531,7 +556,7 @@ def test_an_offset_of_another_size_scales_its_part_of_state_and_slope():
 
 
 def test_the_size_of_the_offset_is_learned_in_bounded_steps_and_not_from_a_few_fixes():
-    rule = OffsetRule(fixes=3)
+    rule = OffsetRule(fixes=3, prior_information=2.0)
     size = first_size(rule)
     assert (size.sigma_m, size.fixes) == (60.0, 0)
     for score in ((-0.2, 0.1), (math.nan, 0.1), (-0.2, 0.1)):
@@ -539,9 +564,9 @@ def test_the_size_of_the_offset_is_learned_in_bounded_steps_and_not_from_a_few_f
     # A score that is no number is no evidence: two fixes are too few.
     assert (size.sigma_m, size.pending, size.fixes) == (60.0, 2, 0)
     size = learned(size, (-0.1, 0.115), (0.0, 0.0), rule)
-    # x moves by the scores over the information 0.97 * 1 + 0.315 = 1.285: exp(-0.5 / 2.57) of the size.
-    assert size.information == approx(1.285)
-    assert (size.sigma_m, size.pending, size.fixes) == (approx(60.0 * math.exp(-0.5 / 2.57)), 0, 3)
+    # x moves by the scores over the information 0.97 * 2 + 0.315 = 2.255: exp(-0.5 / 4.51) of the size.
+    assert size.information == approx(2.255)
+    assert (size.sigma_m, size.pending, size.fixes) == (approx(60.0 * math.exp(-0.5 / 4.51)), 0, 3)
     assert (size.score, size.gained) == (0.0, 0.0)
 
     def after(score, steps):
