@@ -106,7 +106,7 @@ def memory_by_day(folder, days):
                     with suppress(FileNotFoundError):
                         pages = Path(f"/proc/{pid}/statm").read_text().split()[1]
                         found.setdefault(pid, {}).setdefault(int(day[1]), []).append(int(pages) >> 8)
-    assert run.returncode == 0
+    assert run.returncode < 2  # 1: windows are missing, as in the first days of this mission
     return [one for one in found.values() if len(one) >= days and max(one[days - 1]) > 100]
 
 

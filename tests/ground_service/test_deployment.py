@@ -203,11 +203,11 @@ def test_the_runner_has_no_secret_no_network_and_no_archive():
     assert {name for name in SERVICES if "exchange:/exchange" in SERVICES[name]["volumes"]} == {"worker", "runner"}
 
 
-def sh(name, programs="", **environment):
+def sh(name, programs="", *words, **environment):
     """Run a script of the deployment, with a folder of programs before the others."""
     given = {key: str(value) for key, value in environment.items()}
     return subprocess.run(
-        ["sh", str(ROOT / "deploy" / name)], env={"PATH": f"{programs}:{os.environ['PATH']}", **given},
+        ["sh", str(ROOT / "deploy" / name), *words], env={"PATH": f"{programs}:{os.environ['PATH']}", **given},
         stdin=subprocess.DEVNULL, capture_output=True, text=True, check=False,
     )  # fmt: skip
 
@@ -333,6 +333,16 @@ def test_nothing_stays_of_a_base_backup_that_fails(tmp_path):
     programs = program(tmp_path, "pg_basebackup", 'mkdir -p "$2" && echo part > "$2/file"; exit 1')
     done = sh("base-backup.sh", programs, LINNA_WAL=wal)
     assert done.returncode == 1 and list((wal / "base").iterdir()) == []
+
+
+def test_a_segment_that_differs_from_the_archived_one_is_not_overwritten(tmp_path):
+    segments, wal = [tmp_path / name for name in ("one", "two")], tmp_path / "wal"
+    wal.mkdir()
+    for path in segments:
+        path.write_text(path.name)
+    done = [sh("wal-archive.sh", "", str(path), "0001", LINNA_WAL=wal) for path in (segments[0], *segments)]
+    assert [one.returncode for one in done] == [0, 0, 1]
+    assert {path.name: path.read_text() for path in wal.iterdir()} == {"0001": "one"}
 
 
 def test_the_proxy_has_a_second_api_while_one_drains_and_sees_certificates_at_the_documented_reload():

@@ -26,7 +26,17 @@ from payload_emulator.session.spacecraft import loading
 from payload_emulator.session.world.regions import regional_field
 from payload_emulator.sim.detector import SimulatedDetector
 from studies import montecarlo
-from studies.montecarlo import CatalogueErrors, Consistency, Kidnap, anees_bounds, consistency, fly, fly_many, verdict
+from studies.montecarlo import (
+    CatalogueErrors,
+    Consistency,
+    Kidnap,
+    NavigationRun,
+    anees_bounds,
+    consistency,
+    fly,
+    fly_many,
+    verdict,
+)
 from studies.montecarlo_world import TRACKS, crater_world, standard_case
 from tmtc.dictionary.tables import unpack_catalogue_table
 
@@ -71,6 +81,21 @@ def test_each_way_of_not_knowing_its_errors_is_named(fault, words):
     judged = verdict(replace(GOOD, **fault), 50)
     assert not judged.consistent
     assert len(judged.reasons) == 1 and words in judged.reasons[0]
+
+
+def test_figures_of_runs_are_those_of_their_imaging_frames_after_the_first():
+    """Twenty frames to settle with ten times the errors, then three that count and one without an image."""
+    rows = np.r_[np.full(20, 10.0), 1.0, 2.0, 3.0, 50.0]
+    zero, one = np.zeros(24), np.ones(24)
+    run = NavigationRun(
+        zero.astype(int), rows < 50.0, np.full(24, int(Outcome.fixed)), rows[:, None] * [2.0, 1.0, 2.0],
+        np.full((24, 3), 2.0), 4.0 * rows, 6.0 * rows, np.full(24, 4), default_rng(1).normal(size=(24, 2)),
+        10 * one, one, 2 * one, 5 * one, zero,
+    )  # fmt: skip
+    found = consistency([run])
+    assert (found.anees, found.nis_per_degree, found.contained_95) == (8.0, 3.0, approx((1 / 3, 1.0, 1 / 3)))
+    assert (found.median_m, found.largest_m, found.fixed_share) == (6.0, 9.0, 1.0)
+    assert (found.wrong_share, found.own_share, found.degraded_share) == approx((0.1, 0.2, 0.0))
 
 
 def test_errors_of_a_run_differ_for_each_seed(case_of):

@@ -5,6 +5,7 @@ import re
 import shutil
 from dataclasses import replace
 from json import loads
+from types import SimpleNamespace
 
 import numpy as np
 from numpy.testing import assert_allclose
@@ -20,6 +21,7 @@ from payload_emulator.errors import ParameterError, RecordError, ScenarioError
 from payload_emulator.flight.models import load_shipped_model
 from payload_emulator.flight.payload import FlightParameters
 from payload_emulator.flight.vision.detector import OnnxDetector
+from payload_emulator.flight.vision.preprocess import Preparation
 from payload_emulator.session.archive import emulator
 from payload_emulator.session.archive.emulator import emulate, file_entries, sun_warnings
 from payload_emulator.session.archive.recording import load_image, load_record, missing_frames
@@ -385,6 +387,18 @@ def test_frames_whose_sun_is_not_that_of_the_ephemeris_are_named_with_both_azimu
         assert abs(seen - known) == approx(180.0, abs=20.0)  # of a few craters
     monkeypatch.setattr(emulator, "true_sun_direction", lambda world, position, *_: -position / 1.8e6)
     assert len(sun_warnings(world, detector)) == 3 and "elevation -" in sun_warnings(world, detector)[0]
+
+
+@mark.parametrize("seen_deg, elevation, count", [(50.0, 1.0, 0), (140.0, 1.0, 3), (90.0, -1.0, 3), (None, -1.0, 0)])
+def test_a_frame_is_named_if_its_sun_is_off_by_45_degrees_or_below_the_horizon(monkeypatch, seen_deg, elevation, count):
+    """The ephemeris has the Sun at the right of the image, at an azimuth of 90 degrees."""
+    x, seen = np.array([1.0, 0.0, 0.0]), seen_deg and SimpleNamespace(azimuth_deg=seen_deg, determined=True)
+    exposure = SimpleNamespace(image=np.zeros((4, 4), np.uint8), attitude=np.array([1.0, 0, 0, 0, 1.0, 0.0]))
+    for name, value in ("expose", exposure), ("find_sun", seen), ("true_sun_direction", elevation * x):
+        monkeypatch.setattr(emulator, name, lambda *_, value=value: value)
+    truth = SimpleNamespace(positions_mcmf=lambda _: 1.8e6 * x[None])
+    world = SimpleNamespace(frame_utc_ns=np.arange(5) * 10**9, truth=truth)
+    assert len(sun_warnings(world, SimpleNamespace(preparation=Preparation.gray_first))) == count
 
 
 def test_without_attitudes_the_camera_points_as_the_scenario_says(flown, tmp_path):

@@ -9,6 +9,7 @@ from linna.cli import run
 from lunar.catalogue import make_catalogue
 from payload_emulator.errors import ScenarioError
 from payload_emulator.session.archive.scoring import _absolute_percentiles, frames_to_recover
+from payload_emulator.session.scenario import parse_scenario
 from payload_emulator.training.evaluate.sheets import contact_sheet, draw_labels, save_png
 from studies import survey
 from studies.survey import SurveySession, SurveyWindow, format_survey, recall_counts, summary
@@ -119,6 +120,14 @@ def test_what_is_unknown_has_no_figure_and_a_session_without_settled_windows_is_
     assert "not registered" in text and "NIS unknown" in text
     with raises(ScenarioError, match="expected windows with more than 20 frames"):
         summary([session()])
+
+
+def test_a_survey_is_flown_over_its_region_alone():
+    region = survey.Region(300.0, 330.0, -20.0, 40.0)
+    found = survey.survey_scenario(parse_scenario(SCENARIO), region, 2, 9)
+    assert (found.seed, found.window.passes) == (9, 2)
+    assert (found.window.longitude_min_deg, found.window.longitude_max_deg) == (300.0, 330.0)
+    assert (found.window.latitude_min_deg, found.window.latitude_max_deg) == (-20.0, 40.0)
 
 
 @fixture

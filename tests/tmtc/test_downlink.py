@@ -218,7 +218,9 @@ def test_frames_that_come_twice_or_late_are_not_lost_and_uncorrectable_ones_loca
     frames = [octets[k : k + 1279] for k in range(0, len(octets), 1279)]
     again = frames[:20] + frames[:10] + frames[20:40] + frames[5:15] + frames[40:]
     late = frames[:10] + frames[12:20] + frames[10:12] + frames[20:]
-    assert [read(b"".join(one)).frames_lost for one in (again, late, late[:30] + late[33:] + late[:5])] == [0, 0, 3]
+    found = [read(b"".join(one)) for one in (again, late, late[:30] + late[33:] + late[:5])]
+    assert [one.frames_lost for one in found] == [0, 0, 3]
+    assert all({*packets_of(one)} == {*sent()} for one in found[:2])
     octets = bytearray(cadus())
     octets[5 * 1279 + 10 : 5 * 1279 + 10 + 17 * 5 : 5] = bytes(17)
     decoded = read(bytes(octets))

@@ -115,6 +115,11 @@ def test_counts_of_other_content_that_come_again_are_a_restart(counts, restarts,
     assert report(counts).restarts == 0  # copies
 
 
+def test_other_content_behind_a_copy_is_no_restart():
+    found = report([*range(40), *range(5, 15)], same=lambda earlier, _: earlier == 5)
+    assert (found.restarts, found.duplicates, found.conflicts) == (0, 1, 9)
+
+
 @settings(max_examples=80, deadline=None)
 @given(
     st.integers(0, 16383), st.lists(st.integers(1, 400), min_size=1, max_size=60),

@@ -15,6 +15,7 @@ from ground_service.evaluation.smoother import (
     SmootherModel,
     _carried,
     _legs,
+    _step,
     smooth,
     smoother_model,
 )
@@ -249,6 +250,16 @@ def test_burns_part_the_steps_and_count_once(seconds, pushes, legs, kicks):
     burns = tuple(CommandedBurn(EPOCH + at * 10**9, np.array([0.0, push, 0.0]), 0.3) for at, push in pushes)
     found = smooth(filtered, replace(PUSHED, burns=burns))
     assert_same(found, rauch_tung_striebel(filtered, legs, kicks, 0.3), filtered)
+
+
+def test_each_state_is_carried_as_if_it_were_alone():
+    model = replace(QUIET, map_sigma_rtn_m=(60.0, 50.0, 40.0), map_correlation_rad=0.1)
+    states = Session(1).filtered.state[:2]
+    times, steps = np.asarray(tdb_s_from_utc_ns(TIMES[:2]), float), np.array([60.0, 120.0])
+    both = _step(states, times, steps, model)
+    for k in range(2):
+        for one, alone in zip(both, _step(states[k : k + 1], times[k : k + 1], steps[k : k + 1], model), strict=True):
+            assert_allclose(one[k], alone[0], rtol=1e-12)
 
 
 def test_a_jump_of_a_hundred_in_chi_square_parts_the_orbit():

@@ -1,10 +1,13 @@
 """Counts of packets: wraps, gaps, restarts, late and stray packets; decoded columns as the store takes them."""
 
+from dataclasses import replace
+
 import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 from pytest import mark
 
+from ground_service.ingest.core import UNKNOWN, Fragment, fits, join
 from ground_service.ingest.service import ingest_file
 from ground_service.ingest.store import recordings_of_vehicle
 from ground_service.passes.downlink_accounting import account_sequence
@@ -12,8 +15,8 @@ from ground_service.store import repository
 from ground_service.telemetry.packets import batch_of_cut
 from tmtc.dictionary.payload import DICTIONARY
 from tmtc.packets.pus import NO_TICKS, TICKS_PER_SECOND
-from tmtc.packets.space_packets import SEQUENCE_COUNT_LIMIT
-from tmtc.packets.stream import cut_packets
+from tmtc.packets.space_packets import SEQUENCE_COUNT_LIMIT, append_crc, pack_packet
+from tmtc.packets.stream import PacketForm, cut_packets
 
 SECOND = TICKS_PER_SECOND
 
@@ -122,6 +125,20 @@ def test_an_impossible_on_board_time_is_none_and_never_negative_garbage():
     reported = next(columns["reported_ticks"] for columns in rows.values() if "reported_ticks" in columns)
     assert reported.dtype == "int64"
     assert reported.tolist() == [0, 2**48 - 1, NO_TICKS, NO_TICKS, NO_TICKS]
+
+
+def test_parts_of_a_packet_are_joined_where_their_counts_and_octets_agree():
+    """A packet in three frames of 20 octets; both parts hold the second frame, the last one of a stranger differs."""
+    packet = append_crc(pack_packet(0x123, bytes(42), sequence_count=1)[:-2])
+    channel, form = (76, 0, 0, 20), lambda _: PacketForm()
+    begin = Fragment(channel, True, False, 254, 0, 0, 20, packet[:40])
+    end = Fragment(channel, False, True, 255, 1, 900, 920, packet[20:])
+    stranger = replace(end, octets=b"x" + packet[21:])
+    assert (begin.fit, end.fit) == (len(packet) - 40, len(packet) - 20)
+    assert [fits(end, octets) for octets in (end.fit, end.fit - 1, UNKNOWN)] == [True, False, True]
+    assert fits(replace(end, ends=False), 5) and fits(replace(begin, ends=True), 5)
+    assert join([begin, stranger, end], form) == ([(76, packet)], [stranger])
+    assert join([begin, replace(end, count=0, next_count=2)], form)[0] == []
 
 
 def test_only_ingests_with_packets_in_the_time_are_returned(either, synthetic_pass):

@@ -158,6 +158,12 @@ def test_a_request_is_planned_without_further_action(tmp_path, oem, now):
         key = request(ground, windows=2)
         assert ground.read(get_request, key).windows == {"approved": 2}
         assert sum(plan(ground, now).values()) == 0
+        change(ground, key, terms={"windows": 2, "horizon_days": 1.0})  # planned again, and they still count
+        assert ground.read(get_request, key).windows == {"approved": 2}
+        assert sum(plan(ground, now).values()) == 0
+        found = ground.read(store.get_request_record, key)
+        assert standing._first_needed(found, now.utc_ns + 30 * HOUR) == found.anchor_utc_ns
+        assert [ground.write(store.claim_plan, found) for _ in range(2)] == [True, False]
 
 
 def test_data_of_a_replaced_window_belong_to_the_window_that_has_its_time(either, now, monkeypatch):

@@ -1,11 +1,13 @@
 """Gates and paired statistics on simulated passes of known figures: what they claim, and what not."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 from pytest import approx, mark
 
 from ground_service.evaluation.recall import ExpectedCraters
+from ground_service.regression.documents import changed_craters
 from ground_service.regression.gates.calibration import calibrations, gate_noise, pass_noise
 from ground_service.regression.gates.core import (
     COSTS,
@@ -43,6 +45,7 @@ from ground_service.regression.gates.statistics import (
     student_upper_tail,
     unit_sums,
 )
+from ground_service.regression.outcome import PassVerdict, RegressionOutcome
 from lunar.catalogue import make_catalogue
 from lunar.constants import MOON_RADIUS_M
 from lunar.frames import mcmf_from_spherical
@@ -423,6 +426,7 @@ def test_other_metrics_inform_and_never_decide():
     gates = judge(before, after, POLICY)
     volume = by_name(gates)["telemetry.octets_per_frame"]
     assert (volume.outcome, volume.reason) == ("informs", "worse (+55%, 12 passes)")
+    assert volume.level == approx(0.01 / sum(gate.outcome == "informs" for gate in gates))
     assert verdict_of(gates) == "pass"
     few = judge(suite(0, 3), suite(1, 3), POLICY)
     assert {gate.reason for gate in few if gate.outcome == "informs"} == {""}
@@ -456,6 +460,31 @@ def test_the_verdict_is_that_of_the_worst_deciding_gate(outcomes, verdict):
     parts = [one.replace("_", " ").rpartition(":") for one in outcomes.split()]
     gates = [Gate(name or "x", outcome, 1.0, 1.0, 0.1, 0.9) for name, _, outcome in parts]
     assert verdict_of(gates) == verdict
+
+
+def test_a_pass_that_is_not_judged_leaves_the_verdict_to_the_others():
+    gate = Gate("x", "pass", 1.0, 1.0, 0.1, 0.9)
+    for states, verdict in (
+        ("judged, not judged", "pass"),
+        ("not judged", "inconclusive"),
+        ("judged, unusable", "inconclusive"),
+        ("judged, candidate failed", "fail"),
+    ):
+        passes = tuple(PassVerdict(state, "", state, "") for state in states.split(", "))
+        assert RegressionOutcome(None, None, None, (gate,), passes).verdict == verdict
+
+
+def test_changed_craters_are_counted_by_track():
+    """One pass with a shift of the recall, another over the zero meridian."""
+    before, after = suite(0, 2), suite(1, 2, recall=0.5)
+    places = np.radians(np.linspace(-10.0, 10.0, 150))
+    context = SimpleNamespace(catalogue=make_catalogue(places, places, np.full(150, 6_000.0), source="test"))
+    reads = [[SimpleNamespace(frames=one) for one in build.values()] for build in (before, after)]
+    judged = [SimpleNamespace(context=context, baseline_read=a, candidate_read=b) for a, b in zip(*reads, strict=True)]
+    found = changed_craters(judged)
+    hits = [sum(one.craters.hit.sum() for one in build.values()) for build in (before, after)]
+    assert len(found.change) == 300 and found.change.sum() == hits[1] - hits[0] < 0
+    assert np.ptp(found.longitude_deg) == approx(20.0)
 
 
 def test_only_passes_of_both_builds_are_compared_and_what_the_baseline_lacks_is_open():

@@ -143,21 +143,6 @@ def test_old_base_backups_go_with_the_log_that_only_they_need(server):
     assert all(name >= first for name in kept)
 
 
-def test_a_segment_that_differs_from_the_archived_one_is_not_overwritten(tmp_path):
-    (tmp_path / "one").write_bytes(b"1")
-    (tmp_path / "two").write_bytes(b"2")
-    (tmp_path / "wal").mkdir()
-    environment = {"PATH": os.environ["PATH"], "LINNA_WAL": str(tmp_path / "wal")}
-
-    def archive(name):
-        command = ["sh", str(DEPLOY / "wal-archive.sh"), str(tmp_path / name), "0001"]
-        return subprocess.run(command, env=environment, check=False).returncode
-
-    assert archive("one") == 0 and archive("one") == 0 and archive("two") != 0
-    assert (tmp_path / "wal/0001").read_bytes() == b"1"
-    assert [path.name for path in (tmp_path / "wal").iterdir()] == ["0001"]
-
-
 def test_the_database_is_restored_to_a_chosen_second(server, tmp_path):
     prepare_database(server.url, upgrade=True).engine.dispose()
     with open_ground(tmp_path / "home", database_url=server.url) as ground:

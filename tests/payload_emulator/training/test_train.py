@@ -74,6 +74,21 @@ def test_the_best_validation_is_kept(blob_dataset, tmp_path, monkeypatch):
     assert figures["steps"] == 3 and figures["best"] == {"f1": 0.5, "step": 1}
 
 
+def test_a_checkpoint_gives_back_networks_optimiser_and_progress(tmp_path):
+    def files():
+        networks = [torch.nn.Linear(2, 1) for _ in range(2)]
+        return training._RunFiles(tmp_path, *networks, torch.optim.AdamW(networks[0].parameters()), {})
+
+    old, new, progress = files(), files(), training._Progress(3, 60.0, 0.5, 2)
+    old.network(torch.ones(2)).backward()
+    old.optimiser.step()
+    old.save(progress, {})
+    assert new.resume("cpu") == progress
+    assert torch.equal(new.network.weight, old.network.weight) and torch.equal(new.average.bias, old.average.bias)
+    moments = [one.optimiser.state_dict()["state"][0]["exp_avg"] for one in (old, new)]
+    assert torch.equal(*moments) and moments[0].any()
+
+
 def pits_at(places, dataset):
     """Return the learned craters that are seen at these pixels of a blob set, 40 px wide."""
     metres_per_px = 30_000.0 / dataset.focal_px

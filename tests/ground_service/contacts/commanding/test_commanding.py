@@ -113,6 +113,7 @@ self_destruct | {} | name: expected one of the 27 telecommands of the dictionary
 test_connection\0 | {} | name: expected one of the 27 telecommands of the dictionary
 perform_function | {"function_id": "dance", "argument_1": 0, "argument_2": 0} | function_id: expected one of
 perform_function | {"function_id": 1} | argument_1: expected a value
+perform_function | {"function_id": "start_observation", "duration_s": -1} | start_observation.duration_s: expected
 set_housekeeping_interval | {"structure_id": 1, "interval_s": 0} | interval_s: expected
 set_housekeeping_interval | {"structure_id": 1, "interval_s": true} | interval_s: expected a finite number
 test_connection | {"extra": 1} | no such field
@@ -373,7 +374,7 @@ def test_a_time_out_lasts_a_second_to_68_years(ground, timeout_s, accepted):
 
 def test_an_unknown_name_is_answered_with_the_nearest_one(ground):
     for name, near in ("test_conection", "test_connection"), ("zzz", DICTIONARY.telecommands[0].name):
-        with raises(InvalidInput, match=f"of the dictionary, such as {near}, found '{name}'"):
+        with raises(InvalidInput, match=f"^telecommand, name: expected .*, such as {near}, found '{name}'"):
             entered(ground, name)
 
 
