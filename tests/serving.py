@@ -50,5 +50,5 @@ def served(settings, role="operator"):
         yield f"http://127.0.0.1:{listener.getsockname()[1]}", token
     finally:
         service.should_exit = True
-        thread.join(60)
+        thread.join()
         listener.close()

@@ -509,15 +509,17 @@ def test_what_was_measured_is_written_and_read_as_turns_by_folder(tmp_path, monk
     assert [line.split()[-1] for line in lines[1:3]] == ["tests/a", "tests/b"]
 
 
-def test_every_entry_of_the_campaigns_is_a_test_with_a_twin():
+def test_every_entry_of_the_campaigns_is_a_test_with_a_twin_and_a_fault():
     tests = Path(__file__).parent
     with (tests / "campaigns.csv").open(newline="") as lines:
         rows = list(csv.DictReader(lines))
     assert len({row["test"] for row in rows}) == len(rows) > 50
+    known = {name for path in tests.rglob("test_*.py") for name in re.findall(r"def (test_\w+)", path.read_text())}
     for row in rows:
         file, _, name = row["test"].partition("[")[0].partition("::")
         assert f"def {name}(" in (tests / file).read_text() or not name, row
-        assert row["twin"], row
+        assert row["twin"] and row["fault"], row
+        assert set(re.findall(r"\btest_\w+\b(?!\.py)", row["twin"])) <= known, row
 
 
 def test_temporary_files_are_where_the_environment_says():

@@ -178,7 +178,7 @@ def test_the_commands_of_the_tour_run_with_the_installed_wheel(installed, tmp_pa
         assert server.poll() is None
     finally:
         server.terminate()
-        server.wait(60)
+        server.wait()
     for line in tour[2:]:
         in_folder(tmp_path, *command(line))
     assert (tmp_path / "linna-demo/window.cltu").stat().st_size > 0

@@ -519,7 +519,7 @@ def redis_url():
             yield f"redis://linna:tests@127.0.0.1:{port}/0"
         finally:
             server.terminate()
-            server.wait(20)
+            server.wait()
 
 
 @fixture(scope="session")

@@ -66,7 +66,7 @@ class Proxied:
             yield
         finally:
             process.terminate()
-            process.wait(60)
+            process.wait()
 
 
 def make_secrets(folder):
@@ -118,7 +118,7 @@ def proxied(tmp_path_factory):
             yield made
     finally:
         service.terminate()
-        service.wait(60)
+        service.wait()
 
 
 def test_the_service_is_reached_over_new_tls_with_hsts_only(proxied):
@@ -213,4 +213,4 @@ def test_a_renewed_certificate_is_served_after_a_reload_and_clients_stay_connect
 
         wait_for(renewed, "the new certificate")
         wait_for(proxied.answers, "an answer to a client that trusts the new certificate only")
-        opened.ping().wait(10.0)
+        opened.ping().wait()

@@ -101,7 +101,7 @@ def test_a_terminated_server_drains_before_it_ends(tmp_path):
     server.handle_exit(signal.SIGTERM, None)
     assert ask("/readyz") == (503, "close")
     assert ask("/api/v1/missions") == (200, "close")
-    running.join(60)
+    running.join()
     with raises(httpx.ConnectError):
         ask("/readyz")
 

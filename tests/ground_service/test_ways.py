@@ -90,7 +90,7 @@ def flown(session, telecommands=lambda session: b""):
             while block := telemetry.recv(65_536):
                 records += block
             lines.close()
-        thread.join(60.0)
+        thread.join()
         assert not thread.is_alive()
     finally:
         session.stopping.set()

@@ -186,7 +186,7 @@ def dependencies(module):
 @mark.parametrize(
     "old, new, changed",
     [
-        ("STEP = 1", "STEP = 2", {"outer"}), ("by=1", "by=2", {"outer"}),
+        ("STEP = 1", "STEP = 2", {"outer"}), ("by=1", "by=2", {"outer"}), ("x + by", "x - by", {"outer"}),
         ('"nsz", "contract"', '"nsz", "arcp"', {"outer"}), ("@njit\n", "@njit(error_model='numpy')\n", {"outer"}),
         ("np.arange(2000)", "np.arange(2000) + (np.arange(2000) == 1000)", {"of_array"}),
         ('"nsz", "contract"', '"contract", "nsz"', set()),

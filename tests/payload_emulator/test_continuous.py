@@ -130,7 +130,7 @@ class Ground:
 
     def close(self):
         for thread in self._threads:
-            thread.join(60)
+            thread.join()
         for connection in (self._telemetry, self._telecommand, self._console):
             connection.close()
 
@@ -147,7 +147,7 @@ def running(session):
     thread.start()
     try:
         yield thread
-        thread.join(120)
+        thread.join()
         assert not thread.is_alive()
     finally:
         session.stopping.set()
@@ -328,7 +328,7 @@ def test_a_console_that_connects_after_the_end_is_informed(tmp_path):
         with socket.create_connection(("127.0.0.1", session.ports["console"]), timeout=900.0) as console:
             assert json.loads(console.makefile("r").readline())["kind"] == "finished"
             console.sendall(b"run\n")
-            thread.join(60)
+            thread.join()
 
 
 def test_images_that_the_payload_refuses_to_look_at_are_no_frames():

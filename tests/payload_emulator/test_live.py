@@ -106,7 +106,7 @@ def watched(world, loaded):
         yield live, watcher
     finally:
         live.stopping.set()
-        thread.join(120.0)
+        thread.join()
         watcher.close()
     assert not thread.is_alive()
 

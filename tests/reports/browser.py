@@ -95,4 +95,4 @@ def tab(profile):
     finally:
         process.terminate()
         process.stderr.close()
-        process.wait(timeout=30)
+        process.wait()

@@ -106,7 +106,7 @@ def test_a_spacecraft_is_started_again_after_the_kill_has_ended():
         patch.setattr(KillableSpacecraft, "_disconnect", lambda _: None)
         killer = threading.Thread(target=spacecraft.kill)
         killer.start()
-        killing.wait(10.0)
+        killing.wait()
         spacecraft.restart()
         started.set()
         killer.join()

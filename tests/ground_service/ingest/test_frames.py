@@ -266,7 +266,7 @@ def test_an_ingest_killed_at_any_moment_loses_and_doubles_nothing(downlink, tmp_
         process.stdout.readline()
         time.sleep(float(rng.uniform(0.0, 0.4)))
         process.send_signal(signal.SIGKILL)
-        process.wait(60)
+        process.wait()
         process.stdout.close()
     with open_ground(home) as ground:
         again = ingest_file(ground, downlink)

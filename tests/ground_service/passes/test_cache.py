@@ -113,7 +113,7 @@ def test_an_answer_that_many_need_at_once_is_made_once(archive):
 
     def slow():
         begun.set()
-        assert go_on.wait(20)
+        assert go_on.wait()
         return archive.make()
 
     def ask(make):
@@ -123,7 +123,7 @@ def test_an_answer_that_many_need_at_once_is_made_once(archive):
 
     first = threading.Thread(target=ask, args=(slow,))
     first.start()
-    assert begun.wait(20)
+    assert begun.wait()
     others = [threading.Thread(target=ask, args=(archive.make,)) for _ in range(3)]
     for one in others:
         one.start()
@@ -132,6 +132,6 @@ def test_an_answer_that_many_need_at_once_is_made_once(archive):
         assert all(one.is_alive() for one in others)
     go_on.set()
     for one in first, *others:
-        one.join(20)
+        one.join()
     assert found == [1, 1, 1, 1]
     assert not turns

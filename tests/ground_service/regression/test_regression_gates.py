@@ -475,7 +475,7 @@ def test_a_pass_that_is_not_judged_leaves_the_verdict_to_the_others():
 
 
 def test_changed_craters_are_counted_by_track():
-    """One pass with a shift of the recall, another over the zero meridian."""
+    """Two passes over the zero meridian, and a build that finds fewer craters on them."""
     before, after = suite(0, 2), suite(1, 2, recall=0.5)
     places = np.radians(np.linspace(-10.0, 10.0, 150))
     context = SimpleNamespace(catalogue=make_catalogue(places, places, np.full(150, 6_000.0), source="test"))

@@ -457,7 +457,7 @@ def test_a_migration_gives_way_to_requests_that_hold_locks(new_postgres_database
             wait_for(waits, "the migration to wait for the table of jobs")
             # The migration has locked users and waits for jobs; without its limit this is a deadlock.
             connection.execute(text("UPDATE users SET role = role"))
-        upgrade.join(60.0)
+        upgrade.join()
         assert not upgrade.is_alive()
         assert set(METADATA.tables["users"].columns.keys()) < set(reflected(other).tables["users"].columns.keys())
         assert [one.name for one in list_users(ground)] == ["ann"]

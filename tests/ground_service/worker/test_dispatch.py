@@ -88,7 +88,7 @@ def test_an_ingest_is_broken_off_when_the_service_stops_and_goes_on_at_the_next_
         stored.append(result.new)
         if len(stored) == 3:
             middle.set()
-            assert go_on.wait(60.0)
+            assert go_on.wait()
         return result
 
     with monkeypatch.context() as slow:
@@ -98,7 +98,7 @@ def test_an_ingest_is_broken_off_when_the_service_stops_and_goes_on_at_the_next_
             job, behind = enter(ground, downlink), enter(ground, downlink)
             dispatcher.start(job)
             dispatcher.start(behind)
-            assert middle.wait(60.0)
+            assert middle.wait()
             assert 0.0 < row_of(ground, job)["progress"] < 1.0
             ground.stopping.set()  # as closing the dispatcher does, which waits
             go_on.set()
@@ -425,7 +425,7 @@ def test_a_worker_makes_the_report(ground_on_postgres, redis_url, upgraded, synt
             assert worker_answers(settings, timeout_s=30.0)
         finally:
             worker.terminate()
-            worker.wait(60)
+            worker.wait()
     lines = (tmp_path / "worker.log").read_text().splitlines()
     logged = [json.loads(line) for line in lines if line.startswith("{")]
     assert {"job", "kind", "state", "seconds"} <= {key for entry in logged for key in entry}

@@ -65,7 +65,7 @@ def worker(home, environment):
             yield
         finally:
             process.terminate()
-            process.wait(60)
+            process.wait()
 
 
 def job_of(ground, key):

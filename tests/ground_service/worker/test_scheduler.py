@@ -182,7 +182,7 @@ def test_the_command_has_the_lease_until_it_is_stopped(tmp_path, monkeypatch, ca
             wait_for(lambda: has_scheduler(ground), "the scheduler")
             assert cli.run(["scheduler", "--check"]) == 0
             process.terminate()
-            assert process.wait(60) == 0
+            assert process.wait() == 0
         finally:
             process.kill()
             process.wait()

@@ -205,14 +205,15 @@ def test_the_spool_is_locked_until_the_owner_that_lost_the_lease_has_ingested_it
 
         def slow(*given):
             entered.set()
-            assert go_on.wait(20)
+            assert go_on.wait()
             return ingest(*given)
 
         first._spool.ingest = slow
         station.accept().sendall(stream[: 3 * CADU])
-        assert entered.wait(20)
-        service.release(ground, "lab", "first")
-        declared = acquired(ground, "second")
+        assert entered.wait()
+        declared = service.declared_links(ground)["lab"]
+        while not service.acquire(ground, declared, "second", 60 * NS):
+            service.release(ground, "lab", "first")  # which renews it all the time: it may have it back at once
         wait_for(lambda: first.lost, "the lost lease")
         second = LinkRunner(ground, declared, "second")
         threading.Event().wait(0.3)

@@ -345,7 +345,7 @@ def test_octets_that_are_read_late_are_no_silence(ground, station, stream, missi
         runner._stopping.set()
         runner._cut_all.set()
         runner._work.set()
-        ingesting.join(60.0)
+        ingesting.join()
         runner._spool.cut()
         runner._spool.drain()
         if runner._lock is not None:

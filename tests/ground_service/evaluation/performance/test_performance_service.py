@@ -152,7 +152,7 @@ def test_processes_that_make_a_pdf_at_the_same_time_keep_one_file(either, monkey
     key = f"{add_pass(either, 0):032x}"
     blob = either.read(get_report, key).html_sha256
     either.write(repository.change, repository.REPORTS, key, print_sha256=blob)
-    both = threading.Barrier(2, timeout=30.0)
+    both = threading.Barrier(2)
 
     def pdf_of(form, page):
         both.wait()
