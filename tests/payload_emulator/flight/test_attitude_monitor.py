@@ -67,6 +67,12 @@ def test_the_variance_of_the_attitude_is_estimated_without_bias(noise_deg, used_
     assert shown.mean == approx(radians(noise_deg) ** 2, abs=4.0 * used * np.sqrt(2.0 / 4_500.0))
 
 
+def test_frames_count_less_the_more_else_is_uncertain_about_a_rotation():
+    variance = np.array([1.0, 1.0, 4.0]) * radians(0.2) ** 2
+    shown = frame_variances(tuple(RotationEvidence(np.zeros(3), np.eye(3) / one, DECLARED) for one in variance), FLOOR)
+    assert_allclose(shown.weights, 1.0 / (variance - DECLARED**2 + FLOOR**2) ** 2)
+
+
 def test_a_rotation_common_to_all_frames_is_no_noise():
     turn = radians([0.8, -0.5, 0.3])
     assert frame_variances(tuple(frames(24, 0.0, common_rad=turn)), FLOOR).mean < radians(0.1) ** 2

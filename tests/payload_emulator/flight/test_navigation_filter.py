@@ -547,8 +547,9 @@ def test_an_offset_of_another_size_scales_its_part_of_state_and_slope():
     covariance[0, 14] = covariance[14, 0] = 100.0
     mean = start.mean.copy()
     mean[14:17] = [4.0, 6.0, 8.0]
-    grown = replace(start, mean=mean, covariance=covariance).with_offset(20.0, 30.0)
-    assert grown.mean[14:17].tolist() == approx([6.0, 9.0, 8.0])
+    slope = replace(start.slope, mean=mean)
+    grown = replace(start, mean=mean, covariance=covariance, slope=slope).with_offset(20.0, 30.0)
+    assert grown.mean[14:17].tolist() == grown.slope.mean[14:17].tolist() == approx([6.0, 9.0, 8.0])
     assert grown.covariance[14, 14] == approx(2.25 * covariance[14, 14])
     assert grown.covariance[16, 16] == covariance[16, 16] and grown.covariance[0, 0] == covariance[0, 0]
     assert grown.covariance[0, 14] == grown.covariance[14, 0] == approx(150.0)
