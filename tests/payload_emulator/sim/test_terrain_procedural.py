@@ -6,6 +6,8 @@ from numpy.testing import assert_allclose, assert_array_equal
 from pytest import approx, mark
 
 from lunar.catalogue import class_counts, make_catalogue
+from lunar.constants import MOON_RADIUS_M
+from payload_emulator.sim.terrain.craters import SmallCraters
 from payload_emulator.sim.terrain.procedural import ProceduralTerrain
 from payload_emulator.sim.terrain.tiles import LEVELS, tile_angles
 
@@ -48,6 +50,17 @@ def test_heights_depend_neither_on_what_was_asked_before_nor_on_the_tiles_that_a
     second.release_ground()
     assert [second.height_m(one, one) is not None and len(second._slots) for one in (0.1, 0.5, 0.9)] == [1, 1, 1]
     assert len(second._small._cells) == 3
+
+
+def test_small_craters_have_their_density_and_the_power_law_of_their_diameters():
+    found = SmallCraters(3, 500.0, 2_000.0, 0.5, 2.2).around(*np.radians([[10.2, 11.8], [20.2, 21.8]]))
+    latitude, longitude = np.degrees(found.latitude_rad), np.degrees(found.longitude_rad)
+    inside = (latitude > 10.0) & (latitude < 12.0) & (longitude > 20.0) & (longitude < 22.0)
+    diameter_m = 2.0 * found.radius_rad[inside] * MOON_RADIUS_M
+    expected = 0.5 * (MOON_RADIUS_M / 1e3) ** 2 * radians(2.0) * (math.sin(radians(12.0)) - math.sin(radians(10.0)))
+    assert diameter_m.size == approx(expected, abs=4.0 * math.sqrt(expected))
+    share = (2.0**-2.2 - 4.0**-2.2) / (1.0 - 4.0**-2.2)  # over 1 km
+    assert np.mean(diameter_m > 1_000.0) == approx(share, abs=4.0 * math.sqrt(share / expected))
 
 
 def test_there_is_no_step_at_the_prime_meridian_and_other_seeds_are_other_worlds(procedural):
