@@ -330,7 +330,7 @@ def load_catalogue(path: Path | str) -> CraterCatalogue:
     _check_ranges(path, catalogue)
     kept = _first_of_repetitions(catalogue)
     _check_identity(path, catalogue.ids, kept)
-    lost = len(np.setdiff1d(catalogue.ids, catalogue.ids[kept]))
+    lost = len(kept) < len(catalogue.ids) and len(np.setdiff1d(catalogue.ids, catalogue.ids[kept]))
     if lost and is_identified and not path.name.startswith(_PUBLISHED):
         _log.warning(
             "%s: left out %d of %d craters, equal to one before but for the id", path, lost, len(catalogue.ids)

@@ -6,6 +6,7 @@ import threading
 import weakref
 from collections.abc import AsyncIterator, Callable, Iterator
 from contextlib import ExitStack
+from functools import cache
 
 import httpx
 from fastapi import FastAPI
@@ -49,8 +50,8 @@ class OperationsOnDemand:
         self._missing = list(OPERATIONS)
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        segment = scope["path"].removeprefix(f"{API_PREFIX}/").partition("/")[0]
-        self._missing.sort(key=lambda router: router.segment != segment)
+        words = scope["path"].removeprefix(API_PREFIX).split("/")[::-1]  # reports of a pass are one of the reports
+        self._missing.sort(key=lambda router: words.index(router.segment) if router.segment in words else len(words))
         while self._missing and not self._has_operation(scope):
             routes = self._missing.pop(0).load()
             self._app.include_router(routes)
@@ -76,19 +77,16 @@ class LocalDispatcher(Dispatcher):
         """No job runs between requests."""
 
 
-class FollowUpOnDemand:
-    """In-process follow-up work of events; its code is imported on the first event."""
+def follow_on_demand(ground: Ground) -> Callable[[frozenset[str]], None]:
+    """Return the follow-up work of events in this process; its code is imported on the first event."""
 
-    def __init__(self, ground: Ground) -> None:
-        self._ground = ground
-        self._follow_up: Callable[[frozenset[str]], None] | None = None
+    @cache
+    def follow_up() -> Callable[[frozenset[str]], None]:
+        from ground_service.worker.follow_up import FollowUp
 
-    def __call__(self, kinds: frozenset[str]) -> None:
-        if self._follow_up is None:
-            from ground_service.worker.follow_up import FollowUp
+        return FollowUp(ground)
 
-            self._follow_up = FollowUp(self._ground, None)
-        self._follow_up(kinds)
+    return lambda kinds: follow_up()(kinds)
 
 
 class LocalTransport(httpx.BaseTransport):
@@ -101,7 +99,7 @@ class LocalTransport(httpx.BaseTransport):
     def __init__(self, ground: Ground, actor: str, *, background: bool = False) -> None:
         self._ground = ground
         dispatcher = _background_dispatcher(ground) if background else LocalDispatcher(ground)
-        ground.database.listeners.add(FollowUpOnDemand(ground))
+        ground.database.listeners.add(follow_on_demand(ground))
         self._asgi = httpx.ASGITransport(local_app(ground, actor, dispatcher))
         self._loop = asyncio.new_event_loop()
         thread = threading.Thread(target=self._loop.run_forever, name="in-process service", daemon=True)

@@ -9,9 +9,9 @@ from dataclasses import asdict, dataclass, fields, replace
 from typing import Any
 
 from sqlalchemy import Connection, and_, bindparam, delete, func, insert, select, true, update
-from sqlalchemy.dialects import postgresql, sqlite
 
 from ground_service.ingest.core import UNKNOWN, Fragment, fits
+from ground_service.store import repository
 from ground_service.store.repository import FRAGMENTS, INGESTS, MISSIONS, PACKET_DECODINGS, PASSES, PIECES, VEHICLES
 from ground_service.store.vehicles import hold
 
@@ -207,8 +207,7 @@ def add_fragments(connection: Connection, vehicle: int, fragments: Iterable[Frag
         for one in fragments
     ]
     if rows:
-        dialect: Any = postgresql if connection.dialect.name == "postgresql" else sqlite
-        statement = dialect.insert(FRAGMENTS).on_conflict_do_nothing()
+        statement = repository.insert_of(connection)(FRAGMENTS).on_conflict_do_nothing()
         connection.execute(statement, sorted(rows, key=lambda row: row["digest"]))
 
 

@@ -10,7 +10,6 @@ from typing import Any, Protocol
 import numpy as np
 from pydantic import ValidationError
 from sqlalchemy import ColumnElement, Connection, bindparam, case, delete, func, or_, select, update
-from sqlalchemy.dialects import postgresql, sqlite
 
 from ground_service.http.model import PageOf, Paging
 from ground_service.ingest.model import Ingest, IngestResult
@@ -18,7 +17,7 @@ from ground_service.missions.timekeeping.model import RECEPTIONS_LIMIT
 from ground_service.store import repository
 from ground_service.store.event_kinds import ReceptionsEntered, TelemetryReceived, publish
 from ground_service.store.models import NO_TICKS, PACKETS, VEHICLES
-from ground_service.store.repository import insert_columns
+from ground_service.store.repository import insert_columns, insert_of
 from ground_service.store.states import change_if
 from ground_service.telemetry.rollups import rebuild_rollups
 from ground_service.telemetry.values import forget_others
@@ -159,10 +158,9 @@ def note_receptions(
     if connection.execute(count).scalar_one() + len(received) > RECEPTIONS_LIMIT:
         log.warning("vehicle %d: more than %d time reports, none noted", vehicle_id, RECEPTIONS_LIMIT)
         return
-    dialect = postgresql if connection.dialect.name == "postgresql" else sqlite
     changed = 0
     for (ticks, sequence_count), utc_ns in sorted(received.items()):
-        statement: Any = dialect.insert(_RECEPTIONS).values(
+        statement = insert_of(connection)(_RECEPTIONS).values(
             vehicle_id=vehicle_id, ticks=ticks, sequence_count=sequence_count, station=station, earth_utc_ns=utc_ns
         )
         earlier = statement.excluded.earth_utc_ns

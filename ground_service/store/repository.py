@@ -97,7 +97,7 @@ def add_new(connection: Connection, table: Table, **values: Any) -> Any | None:
 
     The function waits for a concurrent insert of the same row by another process.
     """
-    make = _insert_of(connection)
+    make = insert_of(connection)
     key = next(iter(table.primary_key.columns))
     return connection.execute(make(table).values(**values).on_conflict_do_nothing().returning(key)).scalar()
 
@@ -174,7 +174,7 @@ def spacecraft_of(table: Table) -> ColumnElement[Any] | None:
     return None
 
 
-def _insert_of(connection: Connection) -> Any:
+def insert_of(connection: Connection) -> Any:
     """Return the insert statement of the database, which has conflict clauses; each dialect takes long to import."""
     if connection.dialect.name == "postgresql":
         from sqlalchemy.dialects import postgresql

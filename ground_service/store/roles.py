@@ -12,7 +12,6 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 from sqlalchemy import Connection, text
-from sqlalchemy.dialects import postgresql, sqlite
 from sqlalchemy.engine import Dialect
 from sqlalchemy.exc import DBAPIError
 from sqlalchemy.schema import CreateIndex, CreateTable
@@ -152,9 +151,6 @@ def quoted(name: str) -> str:
     return '"' + name.replace('"', '""') + '"'
 
 
-DIALECTS: dict[str, type[Dialect]] = {"sqlite": sqlite.dialect, "postgresql": postgresql.dialect}
-
-
 def schema_statements(dialect: Dialect) -> list[str]:
     """Return the statements that create all tables and indexes, referenced tables first."""
     made: list[CreateTable | CreateIndex] = []
@@ -171,5 +167,7 @@ def create_schema(connection: Connection, snapshot: Path) -> None:
 
 
 if __name__ == "__main__":
-    statements = {name: schema_statements(dialect()) for name, dialect in DIALECTS.items()}
+    from sqlalchemy.dialects import postgresql, sqlite
+
+    statements = {one.dialect.name: schema_statements(one.dialect()) for one in (sqlite, postgresql)}
     Path(sys.argv[1]).write_text(json.dumps(statements, indent=1) + "\n", encoding="utf-8")

@@ -6,8 +6,10 @@ import re
 import sys
 import threading
 import tracemalloc
+from asyncio import run
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
+from unittest.mock import AsyncMock, Mock
 
 import httpx
 from pytest import fixture, mark, raises
@@ -16,7 +18,7 @@ from ground_service.app import create_app
 from ground_service.client import Client, ServiceProblem, connection
 from ground_service.client.connection import ATTEMPTS, BUSY_S, JobFailed, Unreachable
 from ground_service.client.local import local_client
-from ground_service.client.transport import LocalTransport
+from ground_service.client.transport import LocalTransport, OperationsOnDemand
 from ground_service.ground import open_ground
 from ground_service.settings import Settings
 from lunar.timescales import parse_utc, ticks_from_utc_ns
@@ -396,3 +398,11 @@ def test_the_example_of_the_documentation_runs(tmp_path, capsys, monkeypatch):
         "5 packets", "evening pass 2029-08-07T06:00:00.000000Z 0 packets lost",
         "['boot', 'boot', 'boot', 'boot', 'boot']", "404 pass 99: not found",
     ]  # fmt: skip
+
+
+def test_operations_are_looked_for_under_the_last_word_of_their_path_that_names_some():
+    app = AsyncMock(state=Mock(operations=[]), include_router=Mock())
+    scope = {"type": "http", "method": "POST", "path": "/api/v1/passes/1/reports"}
+    run(OperationsOnDemand(app)(scope, None, None))
+    assert {"request_report", "get_report"} <= {route.name for route in app.state.operations}
+    assert "define_pass" not in {route.name for route in app.state.operations}
