@@ -189,16 +189,6 @@ def test_frames_that_cannot_be_rendered_leave_telemetry_only_with_the_reason(
     assert all(len(row["u_px"]) == len(row["sigma_px"]) > 0 for row in rows)
 
 
-def test_a_pass_without_frames_does_not_change_the_verdict_on_the_others(ground, unrendered, make_flyable, make_build):
-    whole = make_flyable(frames=30, seed=41)
-    build = good(ground, make_build, {"synthetic pass 41": whole.packets})
-    outcome = run_regression(ground, [whole.folder, unrendered], build, build, load_policy())
-    assert [one.state for one in outcome.passes] == ["judged", "not judged"]
-    assert outcome.verdict == "pass"
-    alone = run_regression(ground, [whole.folder], build, build, load_policy())
-    assert [repr(gate) for gate in outcome.gates] == [repr(gate) for gate in alone.gates]
-
-
 @mark.parametrize(
     "words, limit, found",
     [

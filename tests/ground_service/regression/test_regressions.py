@@ -25,16 +25,8 @@ from ground_service.regression.archives import (
     pin_archive,
 )
 from ground_service.regression.builds import load_build, register_build, registered_build
-from ground_service.regression.documents import (
-    regression_html,
-    regression_junit,
-    regression_report,
-    regression_text,
-    stretched,
-    verdict_document,
-)
+from ground_service.regression.documents import regression_html, regression_junit, regression_text, verdict_document
 from ground_service.regression.gates.policy import load_policy
-from ground_service.regression.gates.samples import cell_places_deg
 from ground_service.regression.jobs import run_placebo
 from ground_service.regression.model import TELEMETRY_ONLY, ArchiveRecord, KeptReplay
 from ground_service.regression.service import (
@@ -399,35 +391,6 @@ def test_a_crash_is_one_failure_and_the_last_lines_of_its_program_are_in_every_o
     page = regression_html(home, outcome, "0" * 32)
     for text in regression_text(verdict), suite.findtext("system-err"), page:
         assert "Traceback (most recent call last)" in text and "line 49" in text
-
-
-def test_the_report_shows_the_craters_that_changed_side_by_side(home, judge, packets):
-    def thinned(items):
-        kept = {name: values[::2] for name, values in items.items()}
-        return kept | {"v_px": np.append(511.0 - kept["v_px"][:1], kept["v_px"][1:])}  # and one is elsewhere
-
-    outcome = judge(with_detections(packets, thinned))
-    page = regression_html(home, outcome, "0" * 32)
-    assert page == regression_html(home, outcome, "0" * 32)
-    with MonkeyPatch.context() as patched:
-        place = "ground_service.regression.documents.cell_places_deg"
-        patched.setattr(place, lambda cell: np.subtract(cell_places_deg(cell), [[0.0], [360.0]]))
-        report = regression_report(home, outcome, "0" * 32)
-    hits = [
-        [getattr(one, f"{side}_read").frames.craters.hit.sum() for one in outcome.passes]
-        for side in ("baseline", "candidate")
-    ]
-    assert report.craters.change.sum() == sum(hits[1]) - sum(hits[0]) < 0
-    assert np.ptp(np.append(report.craters.longitude_deg, report.craters.false_longitude_deg)) < 20.0
-    tracks = report.changed_tracks
-    assert len(tracks) == 10 and [-one.lost for one in tracks] == sorted(-one.lost for one in tracks)
-    captions = {(one.baseline.caption, one.candidate.caption) for one in tracks}
-    assert captions == {("baseline: detected", "candidate: not detected")}
-    assert [one.first_difference for one in report.passes] == [0, 0]
-    dark = stretched(np.arange(10, 30, dtype=np.uint8).reshape(4, 5))
-    assert (dark.min(), dark.max()) == (0, 255) and np.ptp(np.diff(dark.ravel()[1:-1].astype(int))) <= 1
-    assert "tracks of craters lost" in page and "Left the baseline, right the candidate" in page
-    assert len(keep_regression(home, outcome)) == 32
 
 
 def test_a_zip_of_an_archive_is_the_archive(first, tmp_path, ground):
