@@ -14,7 +14,6 @@ from hypothesis import settings
 from pytest import fixture, mark
 
 from ground_service import clock
-from kernels.memory import give_back
 from tests.cost import TABLE, Cost, read
 
 
@@ -93,22 +92,6 @@ def pytest_collection_finish(session):
     gc.freeze()
     gc.set_threshold(20_000)
     gc.enable()
-
-
-_kept_mib = 0
-
-
-def pytest_runtest_logfinish():
-    """Collect what tests leave in cycles when this process has grown by 100 MiB: few searches find it."""
-    global _kept_mib
-    if _resident_mib() > _kept_mib + 100:
-        gc.collect()
-        give_back()
-        _kept_mib = _resident_mib()
-
-
-def _resident_mib():
-    return int(Path("/proc/self/statm").read_text().split()[1]) >> 8
 
 
 @fixture(scope="session")
