@@ -111,7 +111,6 @@ def memory_by_day(folder, days):
 
 
 @mark.campaign
-@mark.xfail(strict=True, reason="both processes end .07 above it (30 November 2026)")
 def test_the_memory_of_a_simulated_week_ends_within_a_twentieth_of_that_of_its_second_day(tmp_path, monkeypatch):
     monkeypatch.delenv("LINNA_DATA", raising=False)  # with real terrain, the first three days have no window
     processes = memory_by_day(tmp_path / "week", 7)
