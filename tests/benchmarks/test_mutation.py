@@ -9,7 +9,7 @@ from pytest import approx, mark, raises
 from benchmarks import _rows, mutation
 from benchmarks.__main__ import NAMES, main
 from benchmarks._rows import NotMeasured, Row, line, needs, report
-from benchmarks.render import compare_renderings, thinned
+from benchmarks.render import compare_renderings
 from payload_emulator.sim.render.renderer import Rendering
 
 
@@ -69,11 +69,6 @@ def test_shadows_are_counted_over_all_views_and_radiance_is_compared_with_the_me
     assert found.correlation == approx(1.0)
     assert math.isnan(compare_renderings([rendering(0)], [rendering(0)]).shadow_iou)
     assert math.isnan(compare_renderings([], []).correlation)
-
-
-def test_thinning_takes_the_pixels_that_the_march_takes():
-    thin = thinned(rendering(4), 4)
-    assert thin.lit.shape == (4, 4) and thin.lit[0].tolist() == [0.0, 1.0, 1.0, 1.0]
 
 
 @mark.parametrize("unit, ratio", [("packets/s", 2.0), ("s", 0.5), ("packets", 2.0), ("MiB", 0.5)])

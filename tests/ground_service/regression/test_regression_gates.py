@@ -7,7 +7,7 @@ import numpy as np
 from pytest import approx, mark
 
 from ground_service.evaluation.recall import ExpectedCraters
-from ground_service.regression.documents import changed_craters
+from ground_service.regression.documents import changed_craters, stretched
 from ground_service.regression.gates.calibration import calibrations, gate_noise, pass_noise
 from ground_service.regression.gates.core import (
     COSTS,
@@ -485,6 +485,8 @@ def test_changed_craters_are_counted_by_track():
     hits = [sum(one.craters.hit.sum() for one in build.values()) for build in (before, after)]
     assert len(found.change) == 300 and found.change.sum() == hits[1] - hits[0] < 0
     assert np.ptp(found.longitude_deg) == approx(20.0)
+    dark = stretched(np.arange(10, 30, dtype=np.uint8))
+    assert (dark[0], dark[-1]) == (0, 255)
 
 
 def test_only_passes_of_both_builds_are_compared_and_what_the_baseline_lacks_is_open():

@@ -618,6 +618,7 @@ def test_a_build_is_brought_run_and_judged(page, make_flyable, make_build, tmp_p
     expect(page.locator("#regressions table").nth(1)).to_contain_text("recall")
     changed = page.locator("#regressions .report")
     expect(changed).to_contain_text("tracks of craters lost")
+    expect(changed.locator("#fig-changed")).to_contain_text("candidate: not detected")
     lost = changed.locator("table").first.locator("tbody tr td:nth-child(6)").all_inner_texts()
     assert lost == sorted(lost, key=int, reverse=True) and int(lost[0]) > 0
     expect(changed.locator("#fig-changed image")).to_have_count(2 * len(lost))

@@ -39,7 +39,7 @@ class Server:
 
     def run(self, *words, check=True):
         environment = {"PATH": f"{self.bin}:{SYSTEM}", "LINNA_WAL": str(self.wal)}
-        return ran([*self.user, *words], check=check, cwd=self.folder, env=environment)  # fmt: skip
+        return ran([*self.user, *words], check=check, cwd=self.folder, env=environment)
 
     def start(self):
         script = (self.scripts / "postgres.sh").read_text()
