@@ -26,8 +26,9 @@ def test_a_hostile_build_achieves_nothing_as_the_user_of_the_tests(kinds):
 
 
 def test_a_process_that_remains_is_of_the_kind_that_left_it(tmp_path):
-    words = ["-c", "import time; time.sleep(60)", "x/attack.py", "daemon", "archive"]
-    with subprocess.Popen([sys.executable, *words]) as process:
+    words = ["-c", "print(flush=True); input()", "x/attack.py", "daemon", "archive"]
+    with subprocess.Popen([sys.executable, *words], stdin=subprocess.PIPE, stdout=subprocess.PIPE) as process:
+        process.stdout.readline()  # /proc names its words from here on
         try:
             found = [_left(kind, "nothing-like-it", tmp_path, tmp_path) for kind in ("daemon", "stop others")]
         finally:
