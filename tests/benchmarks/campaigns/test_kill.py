@@ -5,12 +5,11 @@ import random
 import sys
 from dataclasses import replace
 
-import httpx
 from pytest import mark
 
-from benchmarks.campaigns._clients import Session, cut_pieces
+from benchmarks.campaigns._clients import cut_pieces
 from benchmarks.campaigns._ledger import FAULTS, AuditLine, Decision, Entered, HandOut, Ledger, judge
-from benchmarks.campaigns.kill import holds, main, the_pass, totals
+from benchmarks.campaigns.kill import holds, main, totals
 
 SHORT = "--laptop --packets 400 --pieces 4 --reports 0 --pause 0.3 --json"
 
@@ -127,19 +126,3 @@ def test_pieces_are_cut_at_any_octet_and_make_up_the_stream():
     in_order = sorted(pieces, key=lambda piece: piece.offset)
     assert b"".join(one.octets for one in in_order) == stream and in_order != pieces
     assert all(stream[one.offset :].startswith(one.octets) for one in pieces)
-
-
-def test_a_pass_whose_definition_was_cut_off_is_looked_for_before_it_is_asked_for_again(monkeypatch):
-    asked = []
-
-    def ask(_self, method, _path, _body=None, key="", *_):
-        asked.append(f"{method} {key}".strip())
-        if method == "GET":
-            return httpx.Response(200, json={"items": []})
-        if key == "pass 0":
-            return httpx.Response(409)
-        return httpx.Response(201, json={"id": 7})
-
-    monkeypatch.setattr(Session, "ask", ask)
-    assert the_pass(Session(("http://nowhere",), "token"), b"{}") == 7
-    assert asked == ["POST pass 0", "GET", "POST pass 1"]

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from pytest import approx, mark, raises
 
-from benchmarks._servers import PidFile, PostgresServer
+from benchmarks._servers import PidFile
 from benchmarks.campaigns._kills import Keeper, Kill, PlannedKill
 from benchmarks.campaigns.mission_kills import KillableSpacecraft, KillTerms, run_killed
 from ground_service.contacts.links import service as links
@@ -109,27 +109,6 @@ def test_a_part_is_killed_at_its_stop_once_and_a_part_that_ends_is_started_again
         part.end()
 
 
-def test_a_part_that_ends_while_the_spacecraft_is_down_is_started_again(tmp_path):
-    part = sleeper(tmp_path)
-    keeper = made_keeper({"worker": part}, (PlannedKill(5, "ended", "spacecraft", 0.0, 0.0),), tmp_path)
-    part.start()
-    try:
-        keeper.start()
-        keeper.at_stop("ended", 5)
-        assert not keeper.wait()  # the spacecraft is down
-        first = part.pid
-        part.kill()
-        while part.pid == first:
-            keeper.check()
-        assert runs(part.pid)
-        keeper.recovered()
-        keeper.stop()
-        assert [one.part for one in keeper.kills] == ["spacecraft"]
-    finally:
-        keeper.recovered()
-        part.end()
-
-
 def test_a_part_that_does_not_start_ends_the_run_with_one_line(tmp_path, monkeypatch):
     monkeypatch.setattr("studies.harness.parts.START_S", 0.5)
     part = Part([sys.executable, "-c", "raise SystemExit('no home')"], tmp_path / "log", lambda: False)
@@ -140,14 +119,6 @@ def test_a_part_that_does_not_start_ends_the_run_with_one_line(tmp_path, monkeyp
     with raises(GroundError, match="supervision of its parts"):
         while True:
             keeper.check()
-
-
-def test_a_part_that_ends_at_once_is_given_up_after_its_attempts(tmp_path):
-    log = tmp_path / "log"
-    part = Part([sys.executable, "-c", "print('no home')"], log, lambda: False, attempts=2)
-    with raises(GroundError, match=r"found: no home \| no home$"):
-        part.start()
-    assert log.read_text() == "no home\n" * 2
 
 
 def test_processes_that_a_killed_run_has_left_are_ended_and_no_others(tmp_path):
@@ -166,15 +137,3 @@ def test_processes_that_a_killed_run_has_left_are_ended_and_no_others(tmp_path):
     finally:
         left.end()
         other.end()
-
-
-def test_a_database_server_continues_with_its_files(tmp_path):
-    first = PostgresServer(tmp_path)
-    assert "//service@" in first.prepare_service()
-    first.part.kill()
-    again = PostgresServer(tmp_path)
-    try:
-        assert again.prepare_service().rpartition("/")[2] == "linna"
-    finally:
-        again.part.end()
-        again.remove()
