@@ -49,7 +49,12 @@ def make_app(settings: Settings) -> Celery:
         worker_prefetch_multiplier=1,
         worker_hijack_root_logger=False,
         broker_connection_retry_on_startup=True,
-        broker_transport_options={"visibility_timeout": VISIBILITY_TIMEOUT_S, "socket_timeout": 10.0},
+        broker_transport_options={
+            "visibility_timeout": VISIBILITY_TIMEOUT_S,
+            "socket_timeout": 10.0,
+            "max_retries": 1,  # of who sends a job, which is kept and sent again later
+            "interval_start": 0.2,
+        },
         task_default_queue=QUEUE,
         worker_max_tasks_per_child=200,
         timezone="UTC",

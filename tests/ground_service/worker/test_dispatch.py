@@ -500,12 +500,14 @@ def test_a_broker_that_breaks_off_is_a_broker_that_is_away(ground, tmp_path, mon
     assert text % error == "the broker is away: reset by peer"
 
 
-def test_a_broker_that_is_away_refuses_nothing(ground, tmp_path):
+def test_a_broker_that_is_away_refuses_nothing_and_nobody_waits_for_it(ground, tmp_path, monkeypatch):
+    pauses = []
+    monkeypatch.setattr("kombu.utils.functional.sleep", pauses.append)
     settings = Settings(home=tmp_path, broker_url="redis://127.0.0.1:1/0")
     dispatcher = dispatcher_for(ground, settings)
     job = dispatcher.submit("report", {"pass_id": 1})
     dispatcher.resume()
-    assert job_row(ground, job)["state"] == "queued"
+    assert job_row(ground, job)["state"] == "queued" and sum(pauses) < 1.0
 
 
 def test_two_files_that_are_ingested_at_once_are_joined(ground_on_postgres, synthetic_pass):
