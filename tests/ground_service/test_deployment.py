@@ -304,7 +304,7 @@ def test_the_broker_grants_what_a_worker_needs_and_no_administration(tmp_path):
     try:
         broker.start()
         worker.start()
-        time.sleep(4.0)  # its scripts run every second
+        time.sleep(2.5)  # its scripts run every second
         worker.finish()
         assert "Error" not in log.read_text()
         client = redis.Redis.from_url(url)

@@ -62,14 +62,19 @@ class Station:
             one.close()
 
 
-WAITS = {"TICK_S": 0.05, "PAUSE_S": 0.1, "RETRY_S": 0.1, "MISSED_S": 0.1, "REFUSED_S": 0.1}
+WAITS = {"TICK_S": 0.05, "PAUSE_S": 0.1, "RETRY_S": 0.1, "MISSED_S": 0.1, "REFUSED_S": 0.1, "RENEW_S": 0.5}
+
+
+@fixture(autouse=True)
+def short_waits(monkeypatch):
+    """Let links wait less than in operation, for events that the test causes."""
+    for name, seconds in WAITS.items():
+        monkeypatch.setattr(runner, name, seconds)
 
 
 @fixture
 def station(monkeypatch):
-    """A station whose link waits less than in operation, for events that the test causes."""
-    for name, seconds in WAITS.items():
-        monkeypatch.setattr(runner, name, seconds)
+    """A station whose link soon comes back."""
     monkeypatch.setattr(core, "FIRST_WAIT_S", 0.05)
     made = Station()
     yield made

@@ -1,6 +1,7 @@
 """One link: reception without loss, contacts, transmission, takeover by another process, on both databases."""
 
 import contextlib
+import os
 import socket
 import struct
 import threading
@@ -409,6 +410,14 @@ def test_a_link_that_is_not_to_reconnect_fails_when_the_station_closes(ground, s
         assert service.get_link(ground, "lab").reason == "closed by the station"
 
 
+def arrive(path, octets):
+    """Let a file appear whole, which has not changed for long."""
+    outside = path.parents[1] / "written"
+    outside.write_bytes(octets)
+    os.utime(outside, (1, 1))
+    outside.rename(path)
+
+
 def test_folders_are_watched_and_telecommands_written(ground, tmp_path, stream, expected):
     incoming, outgoing = tmp_path / "in", tmp_path / "out"
     declare(ground, f'[[links]]\nname = "lab"\nkind = "file"\ndownlink = "{incoming}"\nuplink = "{outgoing}"\n')
@@ -416,7 +425,7 @@ def test_folders_are_watched_and_telecommands_written(ground, tmp_path, stream, 
         wait_for(lambda: "expected a folder" in (service.get_link(ground, "lab").reason or ""), "the reason")
         incoming.mkdir()
         outgoing.mkdir()
-        (incoming / "pass.cadu").write_bytes(stream)
+        arrive(incoming / "pass.cadu", stream)
         keys = released(ground, 2)
         wait_for(lambda: list(outgoing.glob("*.cltu")), "the file")
         wait_for(lambda: runner.octets_received == len(stream), "the telemetry")
@@ -429,11 +438,11 @@ def test_folders_are_watched_and_telecommands_written(ground, tmp_path, stream, 
 def test_the_file_is_not_read_again_by_the_next_process(ground, tmp_path, stream):
     declare(ground, f'[[links]]\nname = "lab"\nkind = "file"\ndownlink = "{tmp_path}/in"\n')
     (tmp_path / "in").mkdir()
-    (tmp_path / "in/pass.cadu").write_bytes(stream)
+    arrive(tmp_path / "in/pass.cadu", stream)
     with operated(ground) as runner:
         wait_for(lambda: runner.octets_received == len(stream), "the telemetry")
     with operated(ground, "another") as runner:
-        (tmp_path / "in/next.cadu").write_bytes(stream[: 2 * CADU])
+        arrive(tmp_path / "in/next.cadu", stream[: 2 * CADU])
         wait_for(lambda: runner.octets_received, "the next file")
         assert runner.octets_received == 2 * CADU
 
