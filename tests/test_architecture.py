@@ -11,7 +11,6 @@ import subprocess
 import sys
 import tarfile
 import tempfile
-from collections import Counter
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -483,21 +482,19 @@ def test_the_collection_imports_no_heavy_library(imported_while_collecting):
     assert imported_while_collecting == []
 
 
-@mark.parametrize("turns, named", [(119.0, []), (121.0, ["a: 121 turns, limit 120"])])
-def test_a_folder_that_costs_a_fifth_more_than_the_table_is_named(turns, named):
-    assert cost.grown({"a": 100.0, "gone": 50.0}, {"a": turns}) == named
-
-
-def test_a_new_folder_may_cost_little():
-    assert cost.grown({}, {"small": 19.0, "large": 21.0}) == ["large: 21 turns, limit 20"]
+def test_a_folder_that_costs_a_fifth_more_than_the_table_is_named_and_a_new_one_may_cost_little():
+    measured = {"a": 119.0, "b": 121.0, "small": 19.0, "large": 21.0}
+    found = ["b: 121 turns, limit 120", "large: 21 turns, limit 20"]
+    assert cost.grown({"a": 100.0, "b": 100.0, "gone": 50.0}, measured) == found
 
 
 def test_what_was_measured_is_written_and_read_as_turns_by_folder(tmp_path, monkeypatch):
     written = tmp_path / "build/cost.csv"
     monkeypatch.setattr(cost, "MEASURED", written)
-    monkeypatch.setattr(cost, "turn_s", lambda: 0.5)
     measured, lines = cost.Cost(), []
-    measured.files = Counter({"tests/b/test_x.py": 0.7, "tests/b/test_y.py": 0.5, "tests/a/test_z.py": 5.0})
+    costs = [("tests/b/test_x.py", 0.7, 0.5), ("tests/b/test_y.py", 0.5, 9.0), ("tests/a/test_z.py", 5.0, 0.4)]
+    for one in (SimpleNamespace(cost=values) for values in costs):
+        measured.pytest_runtest_logreport(one)
     report = SimpleNamespace(section=lines.append, write_line=lines.append)
     config = SimpleNamespace(
         args_source=pytest.Config.ArgsSource.TESTPATHS, getoption={"keyword": "", "markexpr": "not campaign"}.get
@@ -505,6 +502,16 @@ def test_what_was_measured_is_written_and_read_as_turns_by_folder(tmp_path, monk
     measured.pytest_terminal_summary(report, config)
     assert cost.read(written) == {"tests/a": 10.0, "tests/b": 2.0}
     assert [line.split()[-1] for line in lines[1:3]] == ["tests/a", "tests/b"]
+
+
+def test_what_ends_with_the_last_test_is_no_cost_of_its_folder():
+    measured, report = cost.Cost(), SimpleNamespace(nodeid="tests/a/test_z.py::test_z")
+    measured.pytest_runtest_teardown(None)
+    made = measured.pytest_runtest_makereport(SimpleNamespace(when="teardown"))
+    next(made)
+    with pytest.raises(StopIteration):
+        made.send(report)
+    assert report.cost[0] == cost.SHARED and report.cost[2] > 0.0
 
 
 def test_every_entry_of_the_campaigns_is_a_test_with_a_twin_and_a_fault():
