@@ -179,7 +179,7 @@ def count_released(connection: Connection, ccsds_id: int, instance: str, mission
     query = (
         select(func.count())
         .select_from(TELECOMMANDS)
-        .join(vehicles, vehicles.c.id == TELECOMMANDS.c.vehicle_id)
+        .join(vehicles, vehicles.c.id == TELECOMMANDS.c.vehicle_id + 0)  # the index of states: few are released
         .where(vehicles.c.ccsds_id == ccsds_id, vehicles.c.instance == instance, *_sendable(mission_utc_ns))
     )
     return int(connection.execute(query).scalar_one())
