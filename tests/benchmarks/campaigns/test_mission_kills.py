@@ -5,13 +5,12 @@ import sys
 import threading
 from pathlib import Path
 
-from pytest import approx, mark, raises
+from pytest import approx, mark
 
 from benchmarks._servers import PidFile
 from benchmarks.campaigns._kills import Keeper, Kill, PlannedKill
 from benchmarks.campaigns.mission_kills import KillableSpacecraft, KillTerms, run_killed
 from ground_service.contacts.links import service as links
-from ground_service.errors import GroundError
 from lunar.datafolder import DataFolder
 from payload_emulator.session.scenario import parse_scenario
 from studies.harness.parts import Part, runs
@@ -107,18 +106,6 @@ def test_a_part_is_killed_at_its_stop_once_and_a_part_that_ends_is_started_again
         assert again.figures()["by_part"] == {"api": 2}
     finally:
         part.end()
-
-
-def test_a_part_that_does_not_start_ends_the_run_with_one_line(tmp_path, monkeypatch):
-    monkeypatch.setattr("studies.harness.parts.START_S", 0.5)
-    part = Part([sys.executable, "-c", "raise SystemExit('no home')"], tmp_path / "log", lambda: False)
-    keeper = made_keeper({"api": part}, (), tmp_path)
-    with raises(GroundError, match=r"expected it to start within .* found: no home"):
-        part.start()
-    keeper.start()
-    with raises(GroundError, match="supervision of its parts"):
-        while True:
-            keeper.check()
 
 
 def test_processes_that_a_killed_run_has_left_are_ended_and_no_others(tmp_path):
