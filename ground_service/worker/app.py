@@ -52,7 +52,7 @@ def make_app(settings: Settings) -> Celery:
         broker_transport_options={
             "visibility_timeout": VISIBILITY_TIMEOUT_S,
             "socket_timeout": 10.0,
-            "max_retries": 1,  # of who sends a job, which is kept and sent again later
+            "max_retries": 1,  # a job is kept and sent again later
             "interval_start": 0.2,
         },
         task_default_queue=QUEUE,
@@ -99,7 +99,6 @@ def queued_jobs(settings: Settings) -> list[str]:
     app = _app_of(settings)
     try:
         with app.connection_for_read() as connection:
-            connection.ensure_connection(max_retries=1, timeout=5)
             messages = connection.default_channel.client.lrange(QUEUE, 0, -1)
     except RedisError as error:
         raise OperationalError(str(error)) from error
