@@ -19,7 +19,7 @@ from ground_service.evaluation.fixes import (
     snapshot_positions,
     wrong_fixes,
 )
-from ground_service.telemetry.samples import DetectionSamples
+from ground_service.telemetry.samples import DetectionSamples, no_detections
 from lunar.camera import PinholeCamera, nadir_camera_from_mcmf
 from lunar.catalogue import make_catalogue
 from lunar.frames import mcmf_from_spherical
@@ -117,15 +117,18 @@ def test_identifications_are_joined_by_time_place_and_number():
     )
     ids = catalogue.ids
     found = IdentificationSamples(
-        utc_ns=np.array([1000, 2000, 2000, 1500, 1000, 1000]),
-        detection=np.array([1, 0, 1, 0, 0, 0]),  # the third names a detection that is not there, the fourth a time
+        utc_ns=np.array([1000, 2000, 2000, 1500, 2500, 1000, 1000]),
+        # the third names a detection that is not there, the next two a time
+        detection=np.array([1, 0, 1, 0, 0, 0, 0]),
         # the last two a crater that is not there, and one of unknown height
-        crater_id=np.array([ids[2], ids[0], ids[1], ids[1], 10**6, ids[3]]),
+        crater_id=np.array([ids[2], ids[0], ids[1], ids[1], ids[1], 10**6, ids[3]]),
     )
     joined = join_pairs(found, detections, catalogue)
     assert joined.frame.tolist() == [0, 1]
     assert joined.uv_px.tolist() == [[2.0, 5.0], [3.0, 6.0]]
     assert np.array_equal(joined.crater_mcmf_m, catalogue.position_mcmf_m[[2, 0]])
+    for given in (no_detections(), catalogue), (detections, catalogue.select(np.zeros(0, dtype=np.int64))):
+        assert join_pairs(found, *given).frame.tolist() == []
 
 
 METRES_PER_DEG = math.radians(1.0) * 1_737_400.0
