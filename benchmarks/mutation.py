@@ -68,7 +68,8 @@ evaluation|ground_service/evaluation/core ground_service/evaluation/alignment gr
 ground_service/evaluation/smoother ground_service/evaluation/fixes\
 |ground_service/evaluation/test_pass_evaluation ground_service/evaluation/test_alignment \
 ground_service/evaluation/test_recall ground_service/evaluation/test_baseline ground_service/evaluation/test_fixes \
-ground_service/evaluation/test_pass_extras ground_service/evaluation/test_smoother \
+ground_service/evaluation/test_pass_data ground_service/evaluation/test_pass_extras \
+ground_service/evaluation/test_smoother \
 ground_service/evaluation/test_golden_reports
 smoother|ground_service/evaluation/smoother\
 |ground_service/evaluation/test_smoother ground_service/exports/test_exports
