@@ -62,11 +62,14 @@ _TABLE = """\
 accounting|ground_service/ingest/core ground_service/passes/downlink_accounting tmtc/packets/sequence\
 |ground_service/ingest/test_sequence ground_service/passes/test_downlink_accounting tmtc/test_sequence
 verdicts|ground_service/evaluation/verdict ground_service/evaluation/alignment ground_service/evaluation/recall\
-|ground_service/evaluation/test_verdict ground_service/evaluation/test_pass_data
+|ground_service/evaluation/test_verdict ground_service/evaluation/test_pass_data \
+ground_service/evaluation/test_pass_extras
 evaluation|ground_service/evaluation/core ground_service/evaluation/alignment ground_service/evaluation/recall \
 ground_service/evaluation/smoother ground_service/evaluation/fixes\
 |ground_service/evaluation/test_pass_evaluation ground_service/evaluation/test_alignment \
 ground_service/evaluation/test_recall ground_service/evaluation/test_baseline ground_service/evaluation/test_fixes \
+ground_service/evaluation/test_pass_data ground_service/evaluation/test_pass_extras \
+ground_service/evaluation/test_smoother \
 ground_service/evaluation/test_golden_reports
 smoother|ground_service/evaluation/smoother\
 |ground_service/evaluation/test_smoother ground_service/exports/test_exports

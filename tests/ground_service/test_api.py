@@ -378,22 +378,6 @@ def test_a_telecommand_that_is_sent_again_under_its_key_is_queued_once(guarded):
     assert post("/uplink", {**operator, "Idempotency-Key": "later"}, **query).content == b""
 
 
-def test_a_key_whose_work_was_cut_off_is_refused_and_says_why(ground):
-    from ground_service.access.security import once
-    from ground_service.errors import Conflict, DatabaseUnavailable
-
-    def ask(work):
-        return once(ground, actor="ann", operation="window", key="k", request={"a": 1}, work=work)
-
-    def cut_off():
-        raise DatabaseUnavailable("db", "gone")
-
-    with raises(DatabaseUnavailable):
-        ask(cut_off)
-    with raises(Conflict, match="begun and its end is not known"):
-        ask(lambda: {"id": 1})
-
-
 def test_passes_and_windows_sent_again_under_their_key_are_entered_once(client):
     span = {"start": "2029-08-07T06:00:00Z", "stop": "2029-08-07T06:05:00Z", "spacecraft_id": 76}
     for path, more in ("/passes", {}), ("/windows", {"cadence_s": 15.0}):

@@ -10,9 +10,11 @@ from sqlalchemy import BigInteger, Float, Integer, LargeBinary, SmallInteger, fu
 from starlette.datastructures import QueryParams
 
 from ground_service.access import service as users
+from ground_service.access.model import AuditFilter
 from ground_service.access.scopes import DECIDED, ROWS, Scope, check_scope, scope_of
 from ground_service.access.security import SESSION_COOKIE
 from ground_service.access.service import Caller, add_token, add_user, authenticate, change_user
+from ground_service.access.store import list_audit, owner_of
 from ground_service.app import create_app
 from ground_service.errors import Forbidden
 from ground_service.missions.service import add_mission
@@ -203,6 +205,11 @@ def test_an_operation_without_a_decision_and_a_spacecraft_that_is_not_stated_are
     assert fleet.client.post(f"{V1}/windows/search", json=search, headers=fleet.headers).status_code == 403
     assert fleet.client.get(f"{V1}/parameters", headers=fleet.headers).status_code == 403
     assert fleet.client.get(f"{V1}/parameters?spacecraft_id={OURS}", headers=fleet.headers).status_code != 403
+    (route,) = (one for one in CHECKED if one.path == f"{V1}/parameters")
+    for both in (OURS, THEIRS), (THEIRS, OURS):
+        query = QueryParams([("spacecraft_id", one) for one in both])
+        with raises(Forbidden, match=f"found spacecraft_id {THEIRS} of another one"):
+            check_scope(SimpleNamespace(scope={"route": route}, query_params=query), fleet.ours)
 
 
 def test_frames_of_other_spacecraft_in_an_upload_are_not_stored(fleet):
@@ -221,16 +228,16 @@ def test_a_description_or_ephemeris_of_another_mission_is_refused(fleet, tmp_pat
     assert fleet.client.post(f"{V1}/missions", content=text.encode(), headers=fleet.headers).status_code == 201
     orbit = save_circle(tmp_path / "orbit.oem").read_text()
     added = {}
-    for name in "THEIRS", "OURS":
+    for name in "NOBODY", "THEIRS", "OURS":
         named = re.sub(r"(OBJECT_NAME\s*=\s*)\S.*", rf"\g<1>{name}", orbit)
         answer = fleet.client.post(f"{V1}/ephemerides", content=named.encode(), headers=fleet.headers)
         added[name] = answer.status_code
         if name == "THEIRS":
             unlimited = {"Authorization": f"Bearer {add_user(fleet.client.app.state.ground, 'eve', 'operator')}"}
             foreign = fleet.client.post(f"{V1}/ephemerides", content=named.encode(), headers=unlimited).json()["id"]
-        else:
+        elif name == "OURS":
             own = answer.json()["id"]
-    assert added == {"THEIRS": 403, "OURS": 201}
+    assert added == {"NOBODY": 403, "THEIRS": 403, "OURS": 201}
     assert fleet.client.delete(f"{V1}/ephemerides/{foreign}", headers=fleet.headers).status_code == 403
     assert fleet.client.delete(f"{V1}/ephemerides/{own}", headers=fleet.headers).status_code == 204
 
@@ -281,6 +288,12 @@ def test_an_event_of_a_row_is_of_the_spacecraft_of_the_row(event, fleet):
 def test_a_scope_names_its_parameter():
     (route,) = (one for one in CHECKED if one.name == "enter_telecommand")
     assert scope_of(route) == Scope("spacecraft", "body", "spacecraft_id")
+
+
+def test_the_beginning_of_revisions_of_two_spacecraft_belongs_to_neither(fleet):
+    ground = fleet.client.app.state.ground
+    owners = [ground.read(owner_of, ("missions",), REVISION[:length]) for length in (64, 8, 0)]
+    assert owners == [THEIRS, THEIRS, None]
 
 
 OWN = {"Origin": "http://testserver"}
@@ -340,16 +353,11 @@ def test_revocation_of_the_token_ends_its_sessions(client, token):
     (parent,) = [one for one in users.list_tokens(ground, "ann") if one.parent_id is None]
     (session,) = [one for one in users.list_tokens(ground, "ann") if one.parent_id is not None]
     assert session.parent_id == parent.id
+    (noted,) = ground.read(list_audit, AuditFilter(action="start session")).items
+    assert (noted.actor, noted.target) == ("ann", "ann")
+    assert noted.detail == {"token_id": session.id, "parent_id": parent.id}
     users.revoke_token(ground, parent.id)
     assert client.get("/api/v1/session").status_code == 401
-
-
-def test_a_session_ends_with_the_validity_of_its_token(client):
-    ground = client.app.state.ground
-    token = users.add_user(ground, "bob", "viewer", days_valid=0.1)
-    start(client, token)
-    expires = {one.expires for one in users.list_tokens(ground, "bob")}
-    assert len(expires) == 1
 
 
 def test_an_expired_session_is_refused_with_its_reason_and_changes_nothing(client, token):

@@ -15,7 +15,7 @@ from ground_service.access import provider as oidc
 from ground_service.access import service as users
 from ground_service.access.model import AuditFilter
 from ground_service.access.security import SESSION_COOKIE
-from ground_service.access.store import list_audit
+from ground_service.access.store import end_provider_sessions, list_audit
 from ground_service.app import create_app
 from ground_service.errors import Conflict, SettingsError
 from ground_service.settings import Settings, load_settings
@@ -408,8 +408,9 @@ def test_a_wrong_logout_token_ends_nothing(client, provider, subtests):
             assert client.get("/api/v1/session").status_code == 200
 
 
-def test_a_logout_token_is_used_once_and_ends_its_session_only(client, provider):
+def test_a_logout_token_is_used_once_and_ends_its_session_only(client, ground, provider):
     answered(client, provider)
+    assert ground.write(end_provider_sessions, "https://other.example", "u-1", "s-1", time.time_ns()) == {}
     assert sign_out(client, logout_token(provider, sid="s-9")) == 200
     assert client.get("/api/v1/session").status_code == 200
     token = logout_token(provider, jti="j-2")
@@ -419,10 +420,12 @@ def test_a_logout_token_is_used_once_and_ends_its_session_only(client, provider)
 
 def test_ended_sessions_of_the_provider_are_removed(client, ground, provider, monkeypatch):
     answered(client, provider)
+    users.add_token(ground, "ann", days_valid=0.1)
     later = time.time_ns() + users.SESSION_NS + 1
     monkeypatch.setattr("ground_service.worker.upkeep.utc_now_ns", lambda: later)
     tidy(ground, 90)
-    assert users.list_tokens(ground) == [] and len(users.list_users(ground)) == 1
+    assert [(one.kind, one.state) for one in users.list_tokens(ground)] == [("token", "active")]
+    assert len(users.list_users(ground)) == 1
 
 
 def test_the_page_offers_the_provider_only_where_there_is_one(client, tmp_path):

@@ -6,10 +6,9 @@ from types import SimpleNamespace
 from fastapi.security import HTTPAuthorizationCredentials
 from pytest import mark, raises
 
-from ground_service.access.security import caller_of, requires
+from ground_service.access.security import caller_of, once, requires
 from ground_service.access.service import LOCAL_CALLER, Caller, add_user, change_user
-from ground_service.errors import NotAuthorised
-from ground_service.http.problems import Forbidden
+from ground_service.errors import Conflict, DatabaseUnavailable, Forbidden, InvalidInput, NotAuthorised
 
 NO_REQUEST = None
 ROLES = ("viewer", "operator", "admin")
@@ -71,3 +70,31 @@ def test_a_role_may_do_what_those_below_it_may(role, needed):
 def test_a_role_that_does_not_exist_allows_nothing():
     with raises(ValueError, match="not in tuple"):
         Caller("ann", "admin").may("root")
+
+
+def test_a_limited_caller_may_use_what_belongs_to_own_spacecraft_only():
+    limited = Caller("ann", "admin", missions=("ours",), spacecraft=frozenset({76, 78}))
+    asked = (76,), (78, 76), (78, 77), (77,), (None,), (76, None)
+    assert [limited.may_use(*one) for one in asked] == [True, True, False, False, False, False]
+    assert all(LOCAL_CALLER.may_use(*one) for one in asked)
+
+
+def test_a_key_stands_for_one_request_and_is_refused_after_work_that_was_cut_off(ground):
+    def ask(work, key="done", actor="ann", operation="window", number=1):
+        return once(ground, actor=actor, operation=operation, key=key, request={"a": number}, work=work)
+
+    def fail(error):
+        raise error
+
+    assert [ask(lambda one=one: {"id": one}) for one in (1, 2)] == [{"id": 1}] * 2
+    for other in {"key": None}, {"key": "other"}, {"actor": "bob"}, {"operation": "pass"}:
+        assert ask(lambda: {"id": 3}, **other) == {"id": 3}
+    with raises(Conflict, match="expected the request that it was first sent with, found another"):
+        ask(lambda: {"id": 4}, number=2)
+    with raises(InvalidInput):
+        ask(lambda: fail(InvalidInput("window", "", "a time", "none")), "refused")
+    assert ask(lambda: {"id": 5}, "refused") == {"id": 5}
+    with raises(DatabaseUnavailable):
+        ask(lambda: fail(DatabaseUnavailable("db", "gone")), "cut off")
+    with raises(Conflict, match="begun and its end is not known"):
+        ask(lambda: {"id": 6}, "cut off")

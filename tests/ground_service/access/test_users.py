@@ -18,6 +18,7 @@ from ground_service.access.service import (
     list_tokens,
     list_users,
     revoke_token,
+    start_session,
     token_sha256,
 )
 from ground_service.access.store import has_users, list_audit
@@ -239,6 +240,18 @@ def test_further_tokens_expire_too(ground, clock):
         add_token(ground, "bob")
 
 
+@mark.parametrize("days, hours", [(0.25, 5), (2.0, 12), (None, 12)])
+def test_a_session_lasts_a_shift_and_no_longer_than_its_token(ground, clock, days, hours):
+    token = add_user(ground, "ann", "viewer", days_valid=days)
+    clock(NOW + HOUR_NS)
+    secret, session = start_session(ground, token)
+    assert session.expires.utc_ns == NOW + HOUR_NS + hours * HOUR_NS
+    further, _ = start_session(ground, secret)
+    assert [one.parent_id for one in list_tokens(ground)] == [1, 1, None]
+    revoke_token(ground, 1)
+    assert not token_valid(ground, further)
+
+
 def test_the_use_of_a_token_is_noted_after_an_hour_and_not_before(ground, clock):
     """The stored time is the full hour; an hour after that, not after the use, it is written again."""
     token = add_user(ground, "ann", "viewer")
@@ -287,10 +300,24 @@ def test_a_deployment_replaces_role_and_token_and_revokes_the_old_one(ground):
 def test_a_deployment_may_change_the_role_and_keep_the_token(ground):
     ensure_user(ground, "ann", "viewer", SECRET)
     further = add_token(ground, "ann")
+    kept, ended = (start_session(ground, one)[0] for one in (SECRET, further))
     assert ensure_user(ground, "ann", "operator", SECRET)
     caller = authenticate(ground, SECRET)
     assert (caller.role, caller.token_id) == ("operator", 1)
-    assert not token_valid(ground, further)
+    assert [token_valid(ground, one) for one in (kept, further, ended)] == [True, False, False]
+
+
+def test_a_session_does_not_start_with_a_token_that_is_revoked_meanwhile(ground, monkeypatch):
+    token = add_user(ground, "ann", "viewer")
+    caller = authenticate(ground, token)
+    monkeypatch.setattr("ground_service.access.service.authenticate", lambda *_: caller)
+    change_user(ground, "ann", state="disabled")
+    with raises(NotAuthorised, match="token: has been revoked"):
+        start_session(ground, token)
+    change_user(ground, "ann", state="active")
+    revoke_token(ground, 1)
+    with raises(NotAuthorised, match="token: has been revoked"):
+        start_session(ground, token)
 
 
 def test_a_deployment_does_not_bring_a_revoked_token_back(ground):

@@ -16,6 +16,7 @@ from ground_service.evaluation.alignment import (
     places_of_positions,
     reference_states,
 )
+from ground_service.evaluation.core import _not_applicable
 from lunar.ephemeris import ephemeris_from_states
 from lunar.timescales import parse_utc, tdb_s_from_utc_ns
 
@@ -131,12 +132,15 @@ def test_the_ground_path_is_the_arc_over_the_moon_that_does_not_turn_back_also_a
     assert_allclose(ground_path_m(track, 2.0), [0.0, math.pi, 3.0 * math.pi])
 
 
-@mark.parametrize("angle_deg", [0.0, 50.0, 130.0])
+@mark.parametrize("angle_deg", [0.0, 4.0, 4.2, 50.0, 130.0])
 def test_the_angle_of_the_track_with_the_meridian_is_that_of_the_velocity(angle_deg):
     states = flown(10.0, 60.0)
     angle = math.radians(angle_deg)
     normal = np.cross(states.position_icrf_m, states.velocity_icrf_m_s)
     normal *= SPEED_M_S / np.linalg.norm(normal, axis=1, keepdims=True)
     turned = math.cos(angle) * states.velocity_icrf_m_s + math.sin(angle) * normal
-    found = angle_from_meridian_deg(replace(states, velocity_icrf_m_s=turned))
-    assert found == approx(min(angle_deg, 180.0 - angle_deg), abs=1e-6)
+    track = replace(states, velocity_icrf_m_s=turned)
+    assert angle_from_meridian_deg(track) == approx(min(angle_deg, 180.0 - angle_deg), abs=1e-6)
+    # The paper's matching finds no motion from 4.1 degrees on.
+    refused = [bool(_not_applicable(name, track)) for name in ("paper", "spherical", "anchored")]
+    assert refused == [angle_deg > 4.1, angle_deg > 4.1, False]

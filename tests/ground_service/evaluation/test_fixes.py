@@ -19,7 +19,7 @@ from ground_service.evaluation.fixes import (
     snapshot_positions,
     wrong_fixes,
 )
-from ground_service.telemetry.samples import DetectionSamples
+from ground_service.telemetry.samples import DetectionSamples, no_detections
 from lunar.camera import PinholeCamera, nadir_camera_from_mcmf
 from lunar.catalogue import make_catalogue
 from lunar.frames import mcmf_from_spherical
@@ -117,15 +117,18 @@ def test_identifications_are_joined_by_time_place_and_number():
     )
     ids = catalogue.ids
     found = IdentificationSamples(
-        utc_ns=np.array([1000, 2000, 2000, 1500, 1000, 1000]),
-        detection=np.array([1, 0, 1, 0, 0, 0]),  # the third names a detection that is not there, the fourth a time
+        utc_ns=np.array([1000, 2000, 2000, 1500, 2500, 1000, 1000]),
+        # the third names a detection that is not there, the next two a time
+        detection=np.array([1, 0, 1, 0, 0, 0, 0]),
         # the last two a crater that is not there, and one of unknown height
-        crater_id=np.array([ids[2], ids[0], ids[1], ids[1], 10**6, ids[3]]),
+        crater_id=np.array([ids[2], ids[0], ids[1], ids[1], ids[1], 10**6, ids[3]]),
     )
     joined = join_pairs(found, detections, catalogue)
     assert joined.frame.tolist() == [0, 1]
     assert joined.uv_px.tolist() == [[2.0, 5.0], [3.0, 6.0]]
     assert np.array_equal(joined.crater_mcmf_m, catalogue.position_mcmf_m[[2, 0]])
+    for given in (no_detections(), catalogue), (detections, catalogue.select(np.zeros(0, dtype=np.int64))):
+        assert join_pairs(found, *given).frame.tolist() == []
 
 
 METRES_PER_DEG = math.radians(1.0) * 1_737_400.0
@@ -175,11 +178,50 @@ def test_a_crater_serves_one_landmark_others_are_new_and_the_last_report_counts(
     result = compare_map(mapped(craters, 100.0), listed)
     assert result.known == 100
     assert np.all(np.isnan(result.offset_m[result.crater < 0]))
-    first = mapped(craters.select(np.array([5, 5])), 100.0)
-    assert compare_map(first, craters).known == 1
     early, late = mapped(catalogue(4), 300.0, 3), mapped(catalogue(4), 50.0, 4)
     both = (np.concatenate([getattr(one, name) for one in (early, late)]) for name in early.__slots__)
     assert np.array_equal(latest(MappedCraters(*both)).latitude_deg, late.latitude_deg)
+
+
+def near_zero(north_m, east_m=(0.0,), sigma_m=10.0, diameter_m=6e3):
+    """Landmarks near latitude 0, longitude 0, 50 m above the rims; the uncertainty is greatest upwards."""
+    north, east = np.array(north_m) / METRES_PER_DEG, np.array(east_m) / METRES_PER_DEG
+    count = len(north)
+    sigma = np.tile([0.5 * sigma_m, sigma_m, 9.0 * sigma_m], (count, 1))
+    return MappedCraters(
+        np.arange(count), north, east % 360.0, np.full(count, 150.0), np.full(count, diameter_m), sigma, np.ones(count)
+    )
+
+
+@mark.parametrize(
+    "place_m, sigma_m, diameter_m, crater",
+    [
+        # Half a radius is 1500 m, five sigma are 2000 m.
+        ((1490.0, 0.0), 10.0, 6e3, 0), ((1510.0, 0.0), 10.0, 6e3, -1),
+        ((1990.0, 0.0), 400.0, 6e3, 0), ((2010.0, 0.0), 400.0, 6e3, -1),
+        ((0.0, -90.0), 10.0, 6e3 * math.exp(0.39), 0), ((0.0, -90.0), 10.0, 6e3 * math.exp(0.41), -1),
+        ((0.0, -90.0), 10.0, 6e3 * math.exp(-0.39), 0), ((0.0, -90.0), 10.0, 6e3 * math.exp(-0.41), -1),
+        ((0.0, 1590.0), 400.0, 6e3, 1), ((0.0, 1410.0), 400.0, 6e3, 0),
+    ],
+)  # fmt: skip
+def test_a_landmark_is_the_nearest_crater_of_its_size_within_half_a_radius_or_five_sigma(
+    place_m, sigma_m, diameter_m, crater
+):
+    """The second crater is 3000 m east of the first."""
+    longitude = np.radians([0.0, 3000.0 / METRES_PER_DEG])
+    two = make_catalogue(np.zeros(2), longitude, np.full(2, 6e3), source="two", rim_height_m=np.full(2, 100.0))
+    north, east = place_m
+    found = compare_map(near_zero([north], [east], sigma_m, diameter_m), two)
+    assert found.crater.tolist() == [crater]
+    if crater >= 0:
+        assert found.offset_m[0] == approx([east - 3000.0 * crater, north, 50.0], abs=0.01)
+
+
+def test_of_two_landmarks_on_one_crater_the_nearer_one_is_known():
+    one = make_catalogue([0.0], [0.0], [6e3], source="one", rim_height_m=[100.0])
+    for north_m, crater in ([300.0, -100.0], [-1, 0]), ([-100.0, 300.0], [0, -1]):
+        found = compare_map(near_zero(north_m, [0.0, 0.0]), one)
+        assert found.crater.tolist() == crater and np.isnan(found.offset_m[np.array(crater) < 0]).all()
 
 
 def test_a_report_counts_the_landmarks_the_fixes_that_used_them_and_their_distance_from_the_catalogue():

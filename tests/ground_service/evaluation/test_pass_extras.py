@@ -109,12 +109,16 @@ FRAMES, CRATERS = 40, 5
 
 
 def test_the_worst_frames_are_chosen_from_all_frames_and_not_from_those_with_an_image():
-    """Five craters a frame; 20 to 27 lose all, 30 is unfit, and only 0, 10 and 39 have an image."""
+    """Five craters a frame; 20 to 27 lose all, 30 is unfit, and only 0, 10 and 39 have an image.
+
+    Frames 11 and 12 lose all as well, but have three and two craters that count.
+    """
     number, row = np.arange(FRAMES), np.arange(FRAMES * CRATERS)
     frame, zeros = row // CRATERS, 0.0 * row
-    found = -1 * ((frame >= 20) & (frame < 28) | (frame == 30) | (row == 10 * CRATERS))
+    found = -1 * (np.isin(frame, [11, 12, *range(20, 28), 30]) | (row == 10 * CRATERS))
+    size = 3 * ((frame == 11) & (row % CRATERS >= 3) | (frame == 12) & (row % CRATERS >= 2))
     offsets = np.arange(FRAMES + 1) * CRATERS
-    expected = ExpectedCraters(offsets, row, zeros, zeros, zeros + 1.0, 0 * row, zeros == 0.0)
+    expected = ExpectedCraters(offsets, row, zeros, zeros, zeros + 1.0, size, zeros == 0.0)
 
     class Detections(SimpleNamespace):
         def __len__(self):
@@ -125,7 +129,7 @@ def test_the_worst_frames_are_chosen_from_all_frames_and_not_from_those_with_an_
     )
     spread, worst = _choose_frames(inputs, expected, Matches(row[:0], found))
     assert spread == [0, 10, 39]
-    assert worst == list(range(20, 20 + WORST_FRAMES))
+    assert worst == [11, *range(20, 19 + WORST_FRAMES)]
 
 
 COUNT = 60

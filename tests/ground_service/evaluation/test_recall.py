@@ -90,13 +90,16 @@ def test_a_perfect_detector_scores_one_and_a_second_detection_of_a_crater_is_a_f
 
 
 @mark.parametrize(
-    "offset_px, width, hit",
-    [(9.9, 1.0, True), (10.1, 1.0, False), (0.0, 2.1, False), (0.0, 0.45, False), (0.0, 1.9, True)],
-)
-def test_the_limits_of_a_match(expected, offset_px, width, hit):
-    """The 20 km crater is some 98 px wide: half a radius is 24 px, so the paper's 10 px decide."""
-    u, v, d = (one[[2]] for one in (expected.u_px, expected.v_px, expected.diameter_px))
-    found = match_detections(detections(u - offset_px, v, d * width, [2]), expected)
+    "crater, offset_px, width, hit",
+    [
+        (2, 9.9, 1.0, True), (2, 10.1, 1.0, False), (0, 7.3, 1.0, True), (0, 7.5, 1.0, False),
+        (2, 0.0, 2.1, False), (2, 0.0, 0.45, False), (2, 0.0, 1.9, True),
+    ],
+)  # fmt: skip
+def test_the_limits_of_a_match(expected, crater, offset_px, width, hit):
+    """Half a radius is 24 px for 20 km, so that the paper's 10 px decide, and 7.4 px for 6 km."""
+    u, v, d = (one[[crater]] for one in (expected.u_px, expected.v_px, expected.diameter_px))
+    found = match_detections(detections(u - offset_px, v, d * width, [crater]), expected)
     assert bool(found.crater_of_detection[0] >= 0) is hit
 
 

@@ -81,10 +81,10 @@ CONSISTENT = series(
 @mark.parametrize(
     "gap_s, factor, status, draws, bounds, wrong",
     [
-        (15, 3.1, "met", 1, "0.07 to 3.12", ""),  # one draw: 0.2158 / 3, 9.348 / 3 (tables of chi-square)
+        (1800, 3.1, "met", 1, "0.07 to 3.12", ""),  # one draw: 0.2158 / 3, 9.348 / 3 (tables of chi-square)
         # Ten draws: 16.791 / 30, 46.979 / 30.
-        (3600, 2.2, "not met", 10, "0.56 to 1.57", "; sigmas 1.5 times too small"),
-        (3600, 0.31, "met", 10, "0.56 to 1.57", "; sigmas 1.8 times too large"),
+        (1801, 2.2, "not met", 10, "0.56 to 1.57", "; sigmas 1.5 times too small"),
+        (1801, 0.31, "met", 10, "0.56 to 1.57", "; sigmas 1.8 times too large"),
     ],
 )
 def test_nees_is_judged_by_both_bounds_for_its_independent_draws(gap_s, factor, status, draws, bounds, wrong):
@@ -193,6 +193,8 @@ def test_an_experiment_is_judged_apart_and_its_accuracy_from_convergence_on():
     assert table["experiment.convergence"].note.startswith(
         "from an orbit with an error of 1\u202f000 m per axis, 24 h old; until 4 successive errors"
     )
+    exact = replace(limits, p95_error_m=33.0)  # the largest of the last four
+    assert row("experiment.convergence", exact, evaluated).value == 90.0
     judged = list(table.values())
     assert verdict_of(judged)[0].startswith("1 of 2 requirements not met: 95th percentile")
     assert verdict_of(judged, "experiment") == (
@@ -358,6 +360,12 @@ def test_values_that_are_not_finite_are_unknown_and_the_first_sample_is_no_reset
     for triggers, resets in ((), None), (("initialization", "none"), 0.0):
         started = found(series("anchored", reset_trigger=triggers))
         assert row("resets", EVERY_LIMIT, started).value == resets
+
+
+def test_an_offset_smaller_than_the_error_of_the_reference_is_none():
+    for reference_px, offset in (0.4, approx(0.1)), (0.6, 0.0):
+        one = row("pointing.offset", EVERY_LIMIT, found(detector=DETECTOR, reference_px=reference_px))
+        assert (one.value, one.status) == (offset, "met")
 
 
 @mark.parametrize("limit", [float("nan"), float("inf")])
