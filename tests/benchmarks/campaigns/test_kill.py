@@ -97,19 +97,6 @@ def test_each_difference_of_a_row_is_a_fault(fault, rows):
     assert judge(record_of_clients(), rows, LINES)[fault] > 0
 
 
-def test_a_second_hand_out_and_a_changed_answer_are_faults():
-    record = record_of_clients()
-    record.hand_outs.append(HandOut("ann", (1,), b"one"))
-    assert judge(record, ROWS, LINES)["double_hand_outs"] == 1
-    record = record_of_clients()
-    record.count("changed_answers")
-    assert judge(record, ROWS, LINES)["hand_outs_wrong"] == 1
-    sent = changed(3, state="sent")
-    record = record_of_clients()
-    record.count("unanswered_hand_outs")
-    assert judge(record, sent, [*LINES, AuditLine("send", 3, "ann")]).total() == 0
-
-
 def test_every_change_has_one_audit_entry_of_its_actor():
     record = record_of_clients()
     for number in range(len(LINES)):

@@ -1,19 +1,17 @@
 """The distributed form of a mission run: processes are killed, and the figures are those of the embedded form."""
 
 import json
-import sys
 import threading
 from pathlib import Path
 
 from pytest import approx, mark
 
-from benchmarks._servers import PidFile
-from benchmarks.campaigns._kills import Keeper, Kill, PlannedKill
+from benchmarks.campaigns._kills import PlannedKill
 from benchmarks.campaigns.mission_kills import KillableSpacecraft, KillTerms, run_killed
 from ground_service.contacts.links import service as links
 from lunar.datafolder import DataFolder
 from payload_emulator.session.scenario import parse_scenario
-from studies.harness.parts import Part, runs
+from studies.harness.parts import runs
 from studies.mission_run.run import RunTerms, run_mission
 from tests.mission_reports import figures_of
 from tests.scenarios import commanded_scenario
@@ -65,62 +63,3 @@ def test_kills_do_not_change_the_figures_of_a_run(tmp_path, monkeypatch):
     # Nothing is left of the deployment.
     assert not any(runs(pid) for pid, _ in json.loads((folder / "processes.json").read_text()).values())
     assert not Path((folder / "postgres-folder").read_text()).exists()
-
-
-def sleeper(folder):
-    return Part([sys.executable, "-c", "import time; time.sleep(600)"], folder / "log", lambda: True)
-
-
-def made_keeper(parts, planned, folder):
-    return Keeper(parts, planned, lambda: None, lambda: None, folder / "kills.json", lambda line: None)
-
-
-def test_a_part_is_killed_at_its_stop_once_and_a_part_that_ends_is_started_again(tmp_path):
-    part = sleeper(tmp_path)
-    planned = (PlannedKill(5, "ended", "api", 0.0, 0.0), PlannedKill(5, "started", "api", 0.0, 0.0))
-    keeper = made_keeper({"api": part}, planned, tmp_path)
-    part.start()
-    try:
-        first = part.pid
-        keeper.start()
-        keeper.at_stop("ended", 4)  # not due yet
-        assert keeper.wait() and not keeper.kills
-        keeper.at_stop("ended", 5)
-        assert keeper.wait() and [(one.part, one.phase) for one in keeper.kills] == [("api", "ended")]
-        second = part.pid
-        assert second != first and not runs(first) and runs(second)
-        part.kill()
-        while part.pid == second:
-            keeper.check()
-        keeper.stop()
-        assert runs(part.pid) and keeper.figures()["ended_by_themselves"] == {"api": 1}
-        # A run that is continued carries out what is left.
-        again = made_keeper({"api": part}, planned, tmp_path)
-        assert again.kills == keeper.kills and isinstance(again.kills[0], Kill)
-        again.start()
-        again.at_stop("ended", 5)
-        again.at_stop("started", 5)
-        again.wait()
-        again.stop()
-        assert [one.phase for one in again.kills] == ["ended", "started"]
-        assert again.figures()["by_part"] == {"api": 2}
-    finally:
-        part.end()
-
-
-def test_processes_that_a_killed_run_has_left_are_ended_and_no_others(tmp_path):
-    left, other = sleeper(tmp_path), sleeper(tmp_path)
-    left.start()
-    other.start()
-    try:
-        file = tmp_path / "processes.json"
-        PidFile(file).note({"api": left.pid})
-        known = json.loads(file.read_text())
-        # A number that belongs to a later process now.
-        known["worker"] = [other.pid, known["api"][1] - 1]
-        file.write_text(json.dumps(known))
-        PidFile(file).end_left_over()
-        assert not runs(left.pid) and runs(other.pid) and not file.exists()
-    finally:
-        left.end()
-        other.end()
