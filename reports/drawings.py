@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import dataclasses
 import functools
+import gc
 import hashlib
 import io
 import os
@@ -118,6 +119,7 @@ def drawing_processes(wanted: bool) -> Iterator[DrawingProcesses | None]:
 
 def draw_given() -> None:
     """Draw the pictures of standard input, each second one in a copy of this process, onto standard output."""
+    gc.disable()  # the process ends soon
     import reports.figures.axes  # noqa: F401  # before there is something to draw
 
     pictures = pickle.load(sys.stdin.buffer)
@@ -133,6 +135,7 @@ def draw_given() -> None:
         whole = [""] * len(pictures)
         whole[::2], whole[1::2] = drawn, pickle.load(other)
     pickle.dump(whole, sys.stdout.buffer)
+    gc.freeze()
 
 
 def drawing_hash(one: Picture) -> str:
