@@ -11,7 +11,7 @@ from ground_service.http.common import API_PREFIX, GroundOf, IdempotencyKey, Key
 from ground_service.http.model import PageOf
 from ground_service.http.requests import operations
 from ground_service.jobs.service import DispatcherOf, Job, get_job
-from ground_service.passes.service import get_pass
+from ground_service.passes.store import get_pass
 
 REPORT_MEDIA = {"html": "text/html", "pdf": "application/pdf", "json": "application/json"}
 
@@ -34,7 +34,7 @@ def request_report(
     idempotency_key: IdempotencyKey = None,
 ) -> Job:
     """Request a report of a pass; a job creates it."""
-    get_pass(ground, pass_id)
+    ground.read(get_pass, pass_id)
     job_id = dispatcher.submit(
         "report", {"pass_id": pass_id}, job_id=idempotent_id(f"report {pass_id}", caller, idempotency_key)
     )
