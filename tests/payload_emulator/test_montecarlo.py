@@ -163,16 +163,6 @@ def test_a_wrong_catalogue_is_refused_and_the_orbit_coasted(case_of):
     assert np.all(run.error_m < 500.0)
 
 
-def test_false_detections_alone_give_no_fix(case_of):
-    blind = SimulatedDetector(recall=(0.0, 0.0, 0.0, 0.0), precision=0.06)
-    for sigma, frames in ((100.0, 60), (10_000.0, 6)):
-        run = fly(case_of(frames, detector=blind, start_position_m=sigma, start_velocity_m_s=0.1), 7)
-        assert np.count_nonzero(run.fixed) <= 2
-        assert set(run.outcome.tolist()) <= {Outcome.fixed, Outcome.coasted, Outcome.refused}
-    # The wide search was tried, found nothing safe, and says so.
-    assert Outcome.refused in run.outcome.tolist()
-
-
 def test_the_same_seed_gives_the_same_run_on_any_number_of_processes(case_of):
     case = case_of(12)
     alone, together = fly_many(case, [1, 2], workers=1), fly_many(case, [1, 2], workers=2)

@@ -1,7 +1,6 @@
 """An archived pass flown again: from its frames, its scenario, by another build, or from a folder of images."""
 
 import json
-import re
 import shutil
 from dataclasses import replace
 from json import loads
@@ -39,7 +38,6 @@ from payload_emulator.session.scenario import format_scenario, parse_scenario
 from payload_emulator.session.spacecraft.parameter_file import BuildParameters, format_parameters, parse_parameters
 from payload_emulator.session.world import world
 from payload_emulator.session.world.external import load_external
-from payload_emulator.session.world.world import build_world
 from tests.lazy import Lazy
 from tests.scenarios import short_scenario
 from tmtc.dictionary.payload import DICTIONARY
@@ -372,21 +370,6 @@ def test_a_pass_that_is_given_back_shows_the_payload_the_same(flown, tmp_path, c
     assert 'world = "photographs"' in (out / "mission.toml").read_text()
     # Nothing outside the archive is needed to fly it again.
     assert replay_archive(out, FlightBuild(), tmp_path / "replayed")["frames"] == 3
-
-
-def test_frames_whose_sun_is_not_that_of_the_ephemeris_are_named_with_both_azimuths(flown, tmp_path, monkeypatch):
-    folder, data, scenario = copied(flown, tmp_path / "given"), DataFolder(), parse_scenario(TEXT)
-    detector = OnnxDetector(load_shipped_model())
-    for image in sorted(folder.glob("*.png"))[1:]:
-        cv2.imwrite(str(image), np.rot90(cv2.imread(str(image)), 2))
-    world = build_world(scenario, data, load_external(folder, scenario))
-    warnings = sun_warnings(world, detector)
-    assert [text[9:].split("Z: ")[0] for text in warnings] == ["2029-08-08T02:58:20", "2029-08-08T02:58:40"]
-    for text in warnings:
-        seen, known = (float(azimuth) for azimuth in re.findall(r"(?:azimuth|at) (\d+) deg", text))
-        assert abs(seen - known) == approx(180.0, abs=20.0)  # of a few craters
-    monkeypatch.setattr(emulator, "true_sun_direction", lambda world, position, *_: -position / 1.8e6)
-    assert len(sun_warnings(world, detector)) == 3 and "elevation -" in sun_warnings(world, detector)[0]
 
 
 @mark.parametrize("seen_deg, elevation, count", [(50.0, 1.0, 0), (140.0, 1.0, 3), (90.0, -1.0, 3), (None, -1.0, 0)])
