@@ -47,11 +47,6 @@ def test_what_decides_is_tested(difference):
 
 
 @mark.parametrize("unit, ratio", [("packets/s", 2.0), ("s", 0.5), ("packets", 2.0), ("MiB", 0.5)])
-def test_a_ratio_above_one_is_better_than_the_peer(unit, ratio):
-    assert Row("job", 10.0, unit, "peer", 5.0).ratio == ratio
-    assert Row("job", 10.0, unit).ratio is None
-
-
 @mark.parametrize(
     "rows, fault, status",
     [

@@ -13,6 +13,7 @@ from ground_service.ground import open_ground
 from ground_service.passes.archive_import import import_archive
 from ground_service.settings import Settings
 from linna import cli
+from linna.__main__ import main
 from linna.cli import run
 from linna.commands import user
 from linna.parser import ABOVE_ZERO, REQUIRED, all_commands, command_parser, number
@@ -171,6 +172,15 @@ def test_a_list_of_this_machine_imports_neither_http_nor_kernels(tmp_path):
     done = ran(command, check=True)
     none = "no passes: telemetry alone makes none; a pass is a flown window, an imported archive, or a defined interval"
     assert done.stdout == f"{none}\n0 set()\n"
+
+
+def test_a_command_ends_without_a_look_at_every_object(monkeypatch, capsys):
+    monkeypatch.setattr("linna.__main__.run", lambda words: 3)
+    monkeypatch.setattr("gc.set_threshold", lambda _: None)
+    monkeypatch.setattr("gc.freeze", lambda: sys.stdout.write("frozen"))
+    with raises(SystemExit, match="3"):
+        main()
+    assert capsys.readouterr().out == "frozen"
 
 
 NS = 1_000_000_000
