@@ -46,7 +46,6 @@ def test_what_decides_is_tested(difference):
     assert mutation.reason_left_out(difference) is None
 
 
-@mark.parametrize("unit, ratio", [("packets/s", 2.0), ("s", 0.5), ("packets", 2.0), ("MiB", 0.5)])
 @mark.parametrize(
     "rows, fault, status",
     [
