@@ -12,8 +12,6 @@ from tests.serving import wait_for
 from tmtc.dictionary.payload import DICTIONARY
 from tmtc.downlink import encode_cadus
 
-NS = 1_000_000_000
-
 
 def newest_revision(page):
     return page.request.get("/api/v1/missions").json()["items"][0]["revision"]
