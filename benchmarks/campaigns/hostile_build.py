@@ -222,8 +222,8 @@ def write_build(folder: Path, kind: str, service: Service, leftover: str, writab
     limits = {**LIMITS, "wall_s": SHORT_S} if kind in ("outlive", "stop others") else LIMITS
     (folder / "build.toml").write_text(
         f'schema_version = 1\nname = "{kind}"\nfiles = ["attack.py", "targets.json"]\n'
-        f'command = ["{{python}}", "-I", "-S", "{{build}}/attack.py", "{kind}", "{{archive}}", "{{out}}"]\n[limits]\n'
-        + "".join(f"{name} = {value}\n" for name, value in limits.items())
+        f'command = ["{{python}}", "-I", "-S", "{{build}}/attack.py", "{kind}", "{{archive}}", "{{out}}",'
+        f' "{leftover}"]\n[limits]\n' + "".join(f"{name} = {value}\n" for name, value in limits.items())
     )
     return folder / "build.toml"
 
@@ -305,7 +305,7 @@ def _campaign(
                 findings += _judged(profile, kind, run, out / kind.replace(" ", "-"))
             findings += [
                 Finding(profile, kind, "seen from outside", True, text)
-                for text in [*service.damage(), *_left(kind, leftovers[kind], folder, out)]
+                for text in [*service.damage(), *_left(leftovers[kind], folder, out)]
             ]
             _tell(profile, kind, run, findings)
         worker.stdout.close()
@@ -348,12 +348,12 @@ def _judged(profile: str, kind: str, run: Mapping[str, Any], place: Path) -> lis
     return found
 
 
-def _left(kind: str, leftover: str, folder: Path, out: Path) -> list[str]:
-    """Return processes and files of a build that remain after its run, while the next one may run already."""
+def _left(leftover: str, folder: Path, out: Path) -> list[str]:
+    """Return processes and files of a build that remain after its run, while others may run."""
     found = []
     for entry in Path("/proc").glob("[0-9]*"):
         with contextlib.suppress(OSError):
-            if re.search(f"{leftover}|attack.py\0{kind}\0", (entry / "cmdline").read_text(errors="replace")):
+            if re.search(rf"{leftover}\b", (entry / "cmdline").read_text(errors="replace")):
                 found.append(f"process {entry.name} is alive")
     for place in map(Path, ("/tmp", "/dev/shm", "/var/tmp", "/run", "/", folder, out, ROOT)):
         if (place / leftover).exists():

@@ -25,12 +25,12 @@ def test_a_hostile_build_achieves_nothing_as_the_user_of_the_tests(kinds):
     assert result.attempts > 150 and "private root" in result.isolation
 
 
-def test_a_process_that_remains_is_of_the_kind_that_left_it(tmp_path):
-    words = ["-c", "print(flush=True); input()", "x/attack.py", "daemon", "archive"]
+def test_a_process_that_remains_is_of_the_build_that_left_it(tmp_path):
+    words = ["-c", "print(flush=True); input()", "x/attack.py", "leftover-12"]
     with subprocess.Popen([sys.executable, *words], stdin=subprocess.PIPE, stdout=subprocess.PIPE) as process:
         process.stdout.readline()  # /proc names its words from here on
         try:
-            found = [_left(kind, "nothing-like-it", tmp_path, tmp_path) for kind in ("daemon", "stop others")]
+            found = [_left(f"leftover-{number}", tmp_path, tmp_path) for number in (12, 1)]
         finally:
             process.kill()
     assert f"process {process.pid} is alive" in found[0] and found[1] == []
