@@ -135,7 +135,7 @@ def draw_given() -> None:
         whole = [""] * len(pictures)
         whole[::2], whole[1::2] = drawn, pickle.load(other)
     pickle.dump(whole, sys.stdout.buffer)
-    gc.freeze()
+    gc.freeze()  # the last collection would look at every object
 
 
 def drawing_hash(one: Picture) -> str:

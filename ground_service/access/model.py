@@ -50,7 +50,7 @@ class ProviderIdentity(Entity):
     name: str
     role: Role | None = Field(description="Highest role that the provider states; None: none")
     session: str = Field(description="Session of the provider; empty if it states none")
-    stated: str = Field(description="Where the role was looked for, and what was found")
+    stated: str = Field(description="Claims searched for the role, and the values found")
 
 
 class UserRecord(User):

@@ -98,7 +98,7 @@ class IngestResult(Entity):
     last_ticks: int | None = None
     vehicle_ids: tuple[int, ...] = Field(default=(), description="Vehicles whose packets the file contains")
     reception: ReceivedLink | None = Field(default=None, description="null: bare packets")
-    remark: str = Field(default="", description="How the octets contradict the declared link; empty: they fit")
+    remark: str = Field(default="", description="Contradiction between the octets and the declared link; empty: none")
     uplink: tuple[ReceivedControlWords, ...] = ()
 
 

@@ -728,7 +728,7 @@ class MissionCheck(Entity):
     changes: tuple[str, ...] = Field(description="Unified difference to the revision in force")
     windows: tuple[tuple[UtcTime, UtcTime], ...] = Field(default=(), description="Windows of the dry run")
     contradictions: tuple[str, ...] = Field(
-        default=(), description="What the dry run found, such as what excludes all windows"
+        default=(), description="Findings of the dry run, such as a limit that excludes all windows"
     )
 
 

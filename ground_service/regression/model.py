@@ -290,7 +290,7 @@ class Verdict(Entity):
     baseline: JudgedBuild
     candidate: JudgedBuild
     policy: JudgedPolicy
-    headline: str = Field(default="", description="What changed, by how much, where, and whether it matters")
+    headline: str = Field(default="", description="The change, its size and place, and whether it matters")
     frames: int = Field(description="Number of frames processed by both builds")
     frames_needed: int | None = Field(
         description="Number of frames that decide the inconclusive gates; null if unknown"

@@ -299,7 +299,7 @@ class ServiceStatus(Entity):
 
     time: UtcTime = Field(description="Time of day, as in records and logs")
     mission_time: UtcTime = Field(description="Time of operations: contacts, windows and shelved alarms")
-    complaints: list[str] = Field(description="What an operator has to look after; empty: nothing")
+    complaints: list[str] = Field(description="Conditions that need an operator; empty: none")
     jobs: dict[str, int] = Field(description="Number of jobs by state", examples=[{"done": 12, "queued": 1}])
     ingests: dict[str, int] = Field(description="Number of ingests by state", examples=[{"done": 3}])
     queue_age_s: float = Field(description="Age of the oldest job that waits, s; 0: none waits")

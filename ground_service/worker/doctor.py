@@ -31,7 +31,7 @@ class Check(Entity):
 
     name: str = Field(examples=["broker"])
     ok: bool
-    found: str = Field(description="What was found, and what was expected if that is a fault")
+    found: str = Field(description="The value found, and the value expected if that is a fault")
 
 
 def examine(ground: Ground, settings: Settings) -> list[Check]:

@@ -49,7 +49,7 @@ class AlarmChange(Entity):
 class AlarmDetail(Alarm):
     """An alarm with its history, oldest change first."""
 
-    procedure: str | None = Field(description="What to do about it, by the mission description in force")
+    procedure: str | None = Field(description="Procedure of the mission description in force")
     history: list[AlarmChange]
 
 
