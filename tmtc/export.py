@@ -5,11 +5,12 @@ import io
 import json
 import math
 from collections.abc import Collection, Mapping, Sequence
-from datetime import datetime, timedelta
+from itertools import chain
 from typing import Any
 
 import numpy as np
 
+from tmtc.arrays import IntArray
 from tmtc.dictionary.fields import Field
 from tmtc.dictionary.payload import DICTIONARY
 from tmtc.dictionary.schema import Table
@@ -77,19 +78,16 @@ def _array(pyarrow: Any, values: Sequence[object]) -> Any:
 
 FORMATS = ("json", "csv", "parquet")
 
-_EPOCH_TAI = datetime(2000, 1, 1)
+_EPOCH_TAI = np.datetime64("2000-01-01", "us")
 
 Record = dict[str, Any]
 
 
-def format_onboard_time(ticks: int) -> str:
-    """On-board time of the ideal clock, TAI, to the microsecond: `2029-08-07T00:00:37.000000`."""
-    whole, fraction = divmod(int(ticks), TICKS_PER_SECOND)
-    try:
-        time = _EPOCH_TAI + timedelta(seconds=whole, microseconds=fraction * 1_000_000 // TICKS_PER_SECOND)
-    except OverflowError:
-        return ""
-    return time.isoformat(timespec="microseconds")
+def format_onboard_times(ticks: IntArray) -> list[str]:
+    """Return on-board times (n,) of the ideal clock, TAI, to the microsecond: `2029-08-07T00:00:37.000000`."""
+    fraction = (ticks % TICKS_PER_SECOND) * 1_000_000 // TICKS_PER_SECOND
+    times: list[str] = np.datetime_as_string(_EPOCH_TAI + ticks // TICKS_PER_SECOND * 1_000_000 + fraction).tolist()
+    return times
 
 
 def packet_records(tables: Mapping[str, Table]) -> list[Record]:
@@ -100,33 +98,25 @@ def packet_records(tables: Mapping[str, Table]) -> list[Record]:
     numbered: list[tuple[int, Record]] = []
     for name, table in tables.items():
         definition = DICTIONARY.packet(name)
-        columns = {f.name: _column(f, table.columns[f.name]) for f in definition.fields}
-        items: list[list[Record]] = []
+        header = {"packet": name, "apid": definition.apid, "service": definition.service, "subtype": definition.subtype}
+        columns: dict[str, list[Any]] = {
+            **{key: [value] * len(table) for key, value in header.items()},
+            "sequence_count": table.sequence_count.tolist(),
+            "ticks": table.ticks.tolist(),
+            "onboard_tai": format_onboard_times(table.ticks),
+            **{f.name: _column(f, table.columns[f.name]) for f in definition.fields},
+        }
         if definition.group:
-            fields = definition.group.fields
-            cells = [_column(f, table.items[f.name]) for f in fields]
-            names = [f.name for f in fields]
-            flat = [dict(zip(names, row, strict=True)) for row in zip(*cells, strict=True)]
+            flat = _rows({f.name: _column(f, table.items[f.name]) for f in definition.group.fields})
             stops = np.searchsorted(table.item_owner, np.arange(len(table)), side="right").tolist()
-            items = [flat[start:stop] for start, stop in zip([0, *stops[:-1]], stops, strict=True)]
-        for row in range(len(table)):
-            ticks = int(table.ticks[row])
-            record: Record = {
-                "packet": name,
-                "apid": definition.apid,
-                "service": definition.service,
-                "subtype": definition.subtype,
-                "sequence_count": int(table.sequence_count[row]),
-                "ticks": ticks,
-                "onboard_tai": format_onboard_time(ticks),
-            }
-            for column, values in columns.items():
-                record[column] = values[row]
-            if definition.group:
-                record[definition.group.name] = items[row]
-            numbered.append((int(table.packet_index[row]), record))
+            columns[definition.group.name] = [flat[i:j] for i, j in zip([0, *stops[:-1]], stops, strict=True)]
+        numbered += zip(table.packet_index.tolist(), _rows(columns), strict=True)
     numbered.sort(key=lambda pair: pair[0])
     return [record for _, record in numbered]
+
+
+def _rows(columns: Mapping[str, list[Any]]) -> list[Record]:
+    return [dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)]
 
 
 def format_records(records: list[Record], kind: str) -> bytes:
@@ -153,13 +143,8 @@ def format_records(records: list[Record], kind: str) -> bytes:
 def record_columns(records: list[Record]) -> dict[str, list[object]]:
     """Return the records as columns of one length, None where a record has no such value."""
     columns: dict[str, list[object]] = {}
-    for row, record in enumerate(records):
-        for key, value in _flat(record).items():
-            column = columns.setdefault(key, [])
-            column.extend([None] * (row - len(column)))
-            column.append(value)
-    for column in columns.values():
-        column.extend([None] * (len(records) - len(column)))
+    for key in dict.fromkeys(chain.from_iterable(records)):
+        columns |= _spread(key, [record.get(key) for record in records])
     return columns
 
 
@@ -177,16 +162,17 @@ def column_metadata(packet: str) -> dict[str, dict[str, str]]:
     return stated
 
 
-def _flat(record: Record) -> Record:
-    flat: Record = {}
-    for key, value in record.items():
-        if isinstance(value, list) and value and not isinstance(value[0], dict):
-            flat.update({f"{key}_{k}": element for k, element in enumerate(value, start=1)})
-        elif isinstance(value, list):
-            flat[key] = json.dumps(value, allow_nan=False)
-        else:
-            flat[key] = value
-    return flat
+def _spread(key: str, values: list[Any]) -> dict[str, list[object]]:
+    """Return a column as it is, vectors as numbered columns, lists of items as JSON."""
+    lists = [value for value in values if isinstance(value, list)]
+    vectors = [one for one in lists if one and not isinstance(one[0], dict)]
+    if not lists:
+        return {key: values}
+    if not vectors:
+        return {key: [json.dumps(one, allow_nan=False) if isinstance(one, list) else one for one in values]}
+    width = max(map(len, vectors))
+    padded = [[*(one or []), *[None] * width][:width] for one in values]
+    return {f"{key}_{k}": list(column) for k, column in enumerate(zip(*padded, strict=True), start=1)}
 
 
 def _column(f: Field, values: Any) -> list[Any]:
@@ -194,7 +180,7 @@ def _column(f: Field, values: Any) -> list[Any]:
         names = dict(f.labels)
         return [names.get(code, code) for code in values.tolist()]
     listed: list[Any] = values.tolist()
-    return [plain(value) for value in listed] if values.dtype.kind == "f" else listed
+    return listed if values.dtype.kind != "f" or np.isfinite(values).all() else [plain(value) for value in listed]
 
 
 def plain(value: Any) -> Any:

@@ -21,7 +21,8 @@ from ground_service.passes.span import PassSpan, pass_span
 from ground_service.store.vehicles import find_vehicle
 from ground_service.telemetry import rollups
 from ground_service.telemetry import values as declared_values
-from lunar.timescales import format_utc, ticks_from_utc_ns
+from lunar.arrays import IntArray
+from lunar.timescales import ticks_from_utc_ns
 from tmtc.dictionary.fields import Field
 from tmtc.dictionary.payload import DICTIONARY, STRUCTURES
 from tmtc.dictionary.schema import PacketDefinition
@@ -295,8 +296,7 @@ def _declared_records(connection: Connection, span: PassSpan, packet: str) -> li
         raise InvalidInput("packets", packet, f"at most {RECORDS_LIMIT} in a pass", "more")
     cut = whole_packets(np.array([len(octets) for octets in packets.octets], dtype=np.int64))
     records = xtce_records(declared.decoder.decode(b"".join(packets.octets), cut))
-    times = utc_ns_of_ticks(ticks, span.correlations)[0].tolist()
-    return [{"utc": format_utc(time, 9), **one} for time, one in zip(times, records, strict=True)]
+    return _timed(utc_ns_of_ticks(ticks, span.correlations)[0], records)
 
 
 def packets_by_name(connection: Connection, span: PassSpan) -> Iterator[tuple[str, bool, list[Record]]]:
@@ -317,8 +317,12 @@ def _own_records(connection: Connection, span: PassSpan, packet: str) -> list[Re
     records = packet_records({packet: tables[packet]} if packet in tables else {})
     if len(records) > RECORDS_LIMIT:
         raise InvalidInput("packets", packet, f"at most {RECORDS_LIMIT} in a pass", str(len(records)))
-    times = span.utc_ns([int(one["ticks"]) for one in records]).tolist()
-    return [{"utc": format_utc(time, 9), **one} for time, one in zip(times, records, strict=True)]
+    return _timed(span.utc_ns([one["ticks"] for one in records]), records)
+
+
+def _timed(utc_ns: IntArray, records: list[Record]) -> list[Record]:
+    texts = np.datetime_as_string(utc_ns.astype("datetime64[ns]"), unit="ns").tolist()
+    return [{"utc": f"{text}Z", **one} for text, one in zip(texts, records, strict=True)]
 
 
 def _labels(value: SeriesValue) -> dict[str, str]:

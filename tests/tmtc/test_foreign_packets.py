@@ -30,7 +30,7 @@ from tmtc.downlink import (
     propose_settings,
 )
 from tmtc.errors import LinkFormatError, MissingLibrary, UnknownPacket, ValueRefused
-from tmtc.export import format_onboard_time, format_records, packet_records, parquet_octets
+from tmtc.export import format_onboard_times, format_records, packet_records, parquet_octets
 from tmtc.packets.space_packets import append_crc, idle_packet, pack_packet
 from tmtc.packets.stream import UNCHECKED, PacketForm, cut_packets, find_prefix
 from tmtc.xtce.decode import Decoder
@@ -289,10 +289,11 @@ def tables():
 
 
 def test_json_and_csv_hold_the_records_in_order_with_names_and_times_and_no_packets_are_none():
-    assert format_onboard_time(0) == "2000-01-01T00:00:00.000000"
+    days = 10811 * 86400 << 16
+    first, day, last = format_onboard_times(np.array([0, days | 0x8000, (1 << 48) - 1]))
+    assert first == "2000-01-01T00:00:00.000000"
     # 2029-08-07T00:00:00 TAI is 10811 days after the epoch
-    assert format_onboard_time(10811 * 86400 << 16 | 0x8000) == "2029-08-07T00:00:00.500000"
-    assert format_onboard_time((1 << 48) - 1).startswith("2136-02-07T06:28:15.99998")
+    assert day == "2029-08-07T00:00:00.500000" and last.startswith("2136-02-07T06:28:15.99998")
     records = packet_records(tables())
     assert [r["packet"] for r in records] == ["event_info", "detections", "detections", "navigation_state"]
     assert records[0]["event_id"] == "boot" and records[0]["value_2"] is None
