@@ -17,9 +17,10 @@ equation 2.6 (good to 10 us from 1600 to 2200).
 """
 
 from functools import cache
-from typing import Any, overload
+from typing import Any, Literal, overload
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from lunar.arrays import FloatArray, IntArray
 from lunar.constants import NS
@@ -53,6 +54,12 @@ _TDB_TERMS = np.array(
         (0.000002, 21.3299, 5.5431),
     ]
 )
+
+
+def utc_texts(utc_ns: ArrayLike, unit: Literal["us", "ns"] = "ns") -> list[str]:
+    """Return the ISO 8601 texts of epochs (n,), cut to ``unit``, with ``Z``."""
+    texts = np.datetime_as_string(np.asarray(utc_ns, dtype="datetime64[ns]"), unit=unit)
+    return [f"{text}Z" for text in texts.tolist()]
 
 
 @cache

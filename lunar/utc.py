@@ -71,4 +71,4 @@ def format_utc(utc_ns: int, digits: int = 3) -> str:
     step = 10 ** (9 - digits)
     whole, rest = divmod((int(utc_ns) + step // 2) // step * step, NS)
     fraction = f".{rest // step:0{digits}d}" if digits else ""
-    return (_EPOCH + timedelta(seconds=whole)).isoformat()[:19] + fraction + "Z"
+    return (_EPOCH + timedelta(seconds=whole)).strftime("%Y-%m-%dT%H:%M:%S") + fraction + "Z"

@@ -15,7 +15,6 @@ from tmtc.dictionary.fields import Field
 from tmtc.dictionary.payload import DICTIONARY
 from tmtc.dictionary.schema import Table
 from tmtc.errors import MissingLibrary, UnknownPacket
-from tmtc.packets.pus import TICKS_PER_SECOND
 
 _INT64_LIMIT = 1 << 63
 
@@ -85,9 +84,8 @@ Record = dict[str, Any]
 
 def format_onboard_times(ticks: IntArray) -> list[str]:
     """Return on-board times (n,) of the ideal clock, TAI, to the microsecond: `2029-08-07T00:00:37.000000`."""
-    fraction = (ticks % TICKS_PER_SECOND) * 1_000_000 // TICKS_PER_SECOND
-    times: list[str] = np.datetime_as_string(_EPOCH_TAI + ticks // TICKS_PER_SECOND * 1_000_000 + fraction).tolist()
-    return times
+    texts: list[str] = np.datetime_as_string(_EPOCH_TAI + ticks * 15_625 // 1024).tolist()  # 1e6 / 2^16 us
+    return texts
 
 
 def packet_records(tables: Mapping[str, Table]) -> list[Record]:

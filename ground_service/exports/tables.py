@@ -16,7 +16,7 @@ from ground_service.errors import EvaluationError
 from ground_service.evaluation.core import PassInputs
 from lunar.arrays import FloatArray, IntArray
 from lunar.frames import continuous_quaternions
-from lunar.timescales import parse_utc
+from lunar.timescales import parse_utc, utc_texts
 from lunar.visibility import ground_track
 from reports.values import NavigationSeries
 from tmtc.errors import MissingLibrary
@@ -304,8 +304,7 @@ def _csv(table: Table) -> bytes:
 
 def _cells(column: Column) -> list[Any]:
     if column.unit == "utc":
-        texts = np.datetime_as_string(column.values.astype("datetime64[ns]"), unit="ns").tolist()
-        return [f"{text}Z" for text in texts]
+        return utc_texts(column.values)
     values = column.values.tolist()
     return ["" if value != value else value for value in values]  # NaN is not equal to itself
 

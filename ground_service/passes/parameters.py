@@ -22,7 +22,7 @@ from ground_service.store.vehicles import find_vehicle
 from ground_service.telemetry import rollups
 from ground_service.telemetry import values as declared_values
 from lunar.arrays import IntArray
-from lunar.timescales import ticks_from_utc_ns
+from lunar.timescales import ticks_from_utc_ns, utc_texts
 from tmtc.dictionary.fields import Field
 from tmtc.dictionary.payload import DICTIONARY, STRUCTURES
 from tmtc.dictionary.schema import PacketDefinition
@@ -321,8 +321,7 @@ def _own_records(connection: Connection, span: PassSpan, packet: str) -> list[Re
 
 
 def _timed(utc_ns: IntArray, records: list[Record]) -> list[Record]:
-    texts = np.datetime_as_string(utc_ns.astype("datetime64[ns]"), unit="ns").tolist()
-    return [{"utc": f"{text}Z", **one} for text, one in zip(texts, records, strict=True)]
+    return [{"utc": text, **one} for text, one in zip(utc_texts(utc_ns), records, strict=True)]
 
 
 def _labels(value: SeriesValue) -> dict[str, str]:

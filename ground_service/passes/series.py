@@ -25,6 +25,7 @@ from ground_service.telemetry import rollups
 from ground_service.telemetry import store as telemetry
 from ground_service.telemetry.rollups import HOUSEKEEPING_VALUES as PARAMETERS
 from ground_service.telemetry.rollups import STATE_VALUES
+from lunar.timescales import utc_texts
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -150,8 +151,8 @@ def series_document(series: Series) -> dict[str, Any]:
     """Return a series as the JSON values of `model.ParameterSeries`, formatting all times at once."""
     buckets = series.buckets
     columns = (
-        _time_texts(buckets.start_utc_ns),
-        _time_texts(buckets.stop_utc_ns),
+        utc_texts(buckets.start_utc_ns, "us"),
+        utc_texts(buckets.stop_utc_ns, "us"),
         buckets.count.tolist(),
         buckets.low.tolist(),
         buckets.high.tolist(),
@@ -166,12 +167,6 @@ def series_document(series: Series) -> dict[str, Any]:
         "correlation_id": series.correlation_id,
         "buckets": [dict(zip(names, values, strict=True)) for values in zip(*columns, strict=True)],
     }
-
-
-def _time_texts(utc_ns: Any) -> list[str]:
-    """Return the texts of many times, as `http.times.time_text` does."""
-    texts = np.datetime_as_string(np.asarray(utc_ns, dtype=np.int64).astype("datetime64[ns]"), unit="us")
-    return [f"{text}Z" for text in texts.tolist()]
 
 
 KEPT = 64

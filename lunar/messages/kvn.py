@@ -150,10 +150,10 @@ def epoch_texts(tai_ns: ArrayLike, time_system: str) -> list[str]:
     leap = in_leap_second(instants) & (time_system == "UTC")
     counts = from_tai_ns(instants, time_system) - NS * leap
     unit = "ms" if np.all(counts % (NS // 1000) == 0) else "ns"
-    texts = np.datetime_as_string(counts.astype("datetime64[ns]").astype(f"datetime64[{unit}]")).tolist()
+    texts: list[str] = np.datetime_as_string(counts.astype("datetime64[ns]").astype(f"datetime64[{unit}]")).tolist()
     for k in np.flatnonzero(leap).tolist():
         texts[k] = texts[k].replace(":59:59", ":59:60")
-    return [str(text) for text in texts]
+    return texts
 
 
 def utc_epoch_text(utc_ns: int, time_system: str) -> str:
