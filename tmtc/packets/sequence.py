@@ -111,10 +111,8 @@ def extend_counts(
     half = SEQUENCE_COUNT_LIMIT // 2
     step = (np.diff(count) + half) % SEQUENCE_COUNT_LIMIT - half
     restart = (step < -_RESET_FALL) & (count[1:] < _RESET_COUNT) & (np.diff(time) > 0)
-    extended = np.empty(count.size, dtype=np.int64)
-    extended[0] = count[0]
-    extended[1:] = count[0] + np.cumsum(step)
-    if same is not None and np.unique(extended).size < extended.size:
+    extended = np.cumsum(np.append(count[0], step))
+    if same is not None and (step < 1).any() and np.unique(extended).size < extended.size:
         later = np.append(False, np.diff(time) > 0)
         restart[_begins_again(extended, later, restart, lambda a, b: same(order[a], order[b]))] = True
     # after a restart the extended count begins at the next multiple of the limit above all before it
