@@ -88,7 +88,7 @@ def expected_craters(
     radius_m = float(np.mean(np.linalg.norm(points, axis=-1))) if len(points) else 1.0
     reach_m = _view_radius_m(camera, distance - radius_m, _off_nadir_rad(rotations, position_mcmf_m))
     counts = np.zeros(len(position_mcmf_m) + 1, dtype=np.int64)
-    pieces: list[tuple[IntArray, FloatArray, FloatArray]] = []
+    pieces = [(np.zeros(0, dtype=np.int64), np.zeros((0, 2)), np.zeros(0))]
     seeing = (
         np.flatnonzero(np.isfinite(distance) & np.isfinite(rotations).all(axis=(1, 2)))
         if len(points)
@@ -112,9 +112,7 @@ def expected_craters(
         diameter = camera.focal_px * catalogue.diameter_m[near[inside]] / in_camera[inside, 2]
         pieces.append((near[inside], uv[inside], diameter))
         counts[1:] += np.bincount(owner[inside], minlength=len(counts) - 1)
-    index = np.concatenate([p[0] for p in pieces]) if pieces else np.zeros(0, dtype=np.int64)
-    uv = np.concatenate([p[1] for p in pieces]) if pieces else np.zeros((0, 2))
-    diameter = np.concatenate([p[2] for p in pieces]) if pieces else np.zeros(0)
+    index, uv, diameter = map(np.concatenate, zip(*pieces, strict=True))
     return ExpectedCraters(
         np.cumsum(counts, dtype=np.int64), index, uv[:, 0], uv[:, 1], diameter, classes[index], scored[index]
     )
