@@ -140,6 +140,7 @@ def test_series_are_made_short_with_their_extremes(client):
     assert len(buckets) <= 7
     assert sum(bucket["count"] for bucket in buckets) == 40
     assert all(b["min"] <= b["mean"] <= b["max"] for b in buckets)
+    assert {len(one["start"]) for one in buckets} == {len("2029-08-07T00:00:00.000000Z")}
     temperature = client.get(f"{V1}/passes/1/telemetry/temperature_c").json()
     assert (temperature["unit"], temperature["samples"]) == ("degC", 40)
     assert temperature["buckets"][-1]["max"] == approx(23.9)
