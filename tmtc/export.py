@@ -83,8 +83,8 @@ Record = dict[str, Any]
 
 
 def format_onboard_times(ticks: IntArray) -> list[str]:
-    """Return on-board times (n,) of the ideal clock, TAI, to the microsecond: `2029-08-07T00:00:37.000000`."""
-    texts: list[str] = np.datetime_as_string(_EPOCH_TAI + ticks * 15_625 // 1024).tolist()  # 1e6 / 2^16 us
+    """Return the TAI texts, cut to 1 us, of on-board times (n,): ticks of 2^-16 s since 2000, at most 48 bits."""
+    texts: list[str] = np.datetime_as_string(_EPOCH_TAI + ticks * 15_625 // 1024).tolist()  # 15,625/1,024 us a tick
     return texts
 
 
@@ -161,7 +161,7 @@ def column_metadata(packet: str) -> dict[str, dict[str, str]]:
 
 
 def _spread(key: str, values: list[Any]) -> dict[str, list[object]]:
-    """Return a column as it is, vectors as numbered columns, lists of items as JSON."""
+    """Return a column as it is, vectors as numbered columns, lists of items as JSON; None may stand for any of them."""
     lists = [value for value in values if isinstance(value, list)]
     vectors = [one for one in lists if one and not isinstance(one[0], dict)]
     if not lists:

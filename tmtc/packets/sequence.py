@@ -112,7 +112,7 @@ def extend_counts(
     step = (np.diff(count) + half) % SEQUENCE_COUNT_LIMIT - half
     restart = (step < -_RESET_FALL) & (count[1:] < _RESET_COUNT) & (np.diff(time) > 0)
     extended = np.cumsum(np.append(count[0], step))
-    if same is not None and (step < 1).any() and np.unique(extended).size < extended.size:
+    if same is not None and (step < 1).any() and np.unique(extended).size < extended.size:  # quick for rising counts
         later = np.append(False, np.diff(time) > 0)
         restart[_begins_again(extended, later, restart, lambda a, b: same(order[a], order[b]))] = True
     # after a restart the extended count begins at the next multiple of the limit above all before it
