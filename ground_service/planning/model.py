@@ -147,7 +147,7 @@ class WindowPrediction(Entity):
     )
     storage_peak_octets: int | None = None
     downlinked_by: UtcTime | None = Field(
-        default=None, description="When its data are downlinked; null: not within the contacts"
+        default=None, description="Time of the downlink of its data; null: not within the contacts"
     )
 
 
@@ -219,7 +219,7 @@ class PlanForecast(Entity):
     spacecraft_id: int
     instance: str
     ephemeris_id: int | None
-    reason: str | None = Field(description="Why there are no values, or only for a part of the interval")
+    reason: str | None = Field(description="Reason of missing values, in the whole interval or in a part of it")
     data: list[str]
     step_s: float
     time_s: list[float] = Field(description="UTC, POSIX seconds at the middle of each step")
@@ -242,7 +242,7 @@ class CraterDensity(Entity):
     """Craters per 10,000 km2 in cells of the map; rows from south to north, cells from 180 W to 180 E."""
 
     source: str | None = Field(description="Name of the catalogue")
-    reason: str | None = Field(description="Why there is no density")
+    reason: str | None = Field(description="Reason of a missing density")
     cell_deg: float
     diameter_km: Span
     rows: list[list[float]]
@@ -320,7 +320,7 @@ class Window(Entity):
     version: int
     created_by: str
     created: UtcTime
-    decided_by: str | None = Field(description="Who approved it, made it a draft again or declared it failed")
+    decided_by: str | None = Field(description="Person who approved it, made it a draft again or declared it failed")
     changed: UtcTime
 
 
@@ -374,7 +374,7 @@ class WindowRecord(Window):
 class PlannedTelecommand(Entity):
     """A telecommand of a window before its release."""
 
-    time: UtcTime | None = Field(description="When it acts on board; null: on reception")
+    time: UtcTime | None = Field(description="Time of execution on board; null: on reception")
     name: str = Field(examples=["perform_function"])
     text: str = Field(description="Its arguments with names and units")
 
@@ -487,7 +487,7 @@ class RequestPlan(Entity):
     request_id: int
     planned: UtcTime | None
     until: UtcTime | None = Field(description="End of the planned time")
-    reason: str | None = Field(description="Why nothing, or less than the horizon, was planned")
+    reason: str | None = Field(description="Reason of an empty plan, or one shorter than the horizon")
     basis: str = Field(description="Hash of what the plan depends on, except time")
     candidates: list[PlannedCandidate]
     replaced: list[dict[str, Any]] = Field(

@@ -53,7 +53,7 @@ class KeptArchive(Entity):
         "telemetry only: the frames are not available",
         examples=["complete"],
     )
-    reason: str = Field(description="Why frames are not available; otherwise empty")
+    reason: str = Field(description="Reason of missing frames; empty: all are available")
     octets: int
     pinned: bool
     kept_since: UtcTime
@@ -363,7 +363,7 @@ class RegressionSummary(Entity):
     baseline: str = Field(description="Identity of the baseline build")
     baseline_title: str
     headline: str = Field(description="First line of the verdict")
-    reasons: list[str] = Field(description="Why the verdict is not pass, the most important first")
+    reasons: list[str] = Field(description="Reasons of a verdict other than pass, the most important first")
     gates: int = Field(description="Number of gates")
     gates_failed: int
     gates_inconclusive: int

@@ -72,7 +72,7 @@ class Telecommand(Entity):
         default=None, description="Release by the on-board clock, not corrected; null: not time-tagged"
     )
     reports: list[CommandReport]
-    remark: str = Field(description="Why it failed, was rejected or timed out; empty: it did not")
+    remark: str = Field(description="Reason of failure, rejection or time-out; empty: none of them")
 
 
 class CommandRecord(Entity):
@@ -186,7 +186,7 @@ class Handover(Entity):
     note: str = ""
     noted_by: str | None = None
     noted: UtcTime | None = None
-    held_by: str | None = Field(default=None, description="Who stopped release and transmission; null: nobody")
+    held_by: str | None = Field(default=None, description="Person who stopped release and transmission; null: nobody")
     held: UtcTime | None = Field(default=None, description="Since when")
     hold_reason: str = ""
 

@@ -22,7 +22,7 @@ class LinkStatus(Entity):
     uplink: str | None
     send: str = Field(description="automatic or manual", examples=["automatic"])
     state: LinkState
-    reason: str | None = Field(description="Why it waits or has failed, or what is wrong with a connected station")
+    reason: str | None = Field(description="Reason of waiting or failure, or fault of a connected station")
     owner: str | None = Field(description="Process that operates the link; null: none does now")
     octets: int = Field(description="Octets received and stored")
     heard: UtcTime | None = Field(description="Mission time of the last reception")

@@ -50,7 +50,7 @@ class TimeReport(Entity):
     boot_count: int
     correlation_id: int = Field(description="0 is an ideal clock")
     residual_ns: int
-    remark: str = Field(default="", description="Why it does not count: the clock of the station is doubted")
+    remark: str = Field(default="", description="Reason of exclusion: the clock of the station is doubted")
 
 
 class Correlation(Entity):

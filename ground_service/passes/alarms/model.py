@@ -29,7 +29,7 @@ class Alarm(Entity):
     limits: str = Field(description="Limits of the parameter; empty for an event")
     first: UtcTime = Field(description="Spacecraft time of the first packet with the condition")
     last: UtcTime = Field(description="Spacecraft time of the last packet with the condition")
-    raised: UtcTime = Field(description="When this service raised the alarm, time of day")
+    raised: UtcTime = Field(description="Time of day at which this service raised the alarm")
     acknowledged_by: str | None = None
     acknowledged: UtcTime | None = Field(default=None, description="Time of day")
     shelved_by: str | None = None
